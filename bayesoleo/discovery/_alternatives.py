@@ -66,25 +66,23 @@ class Loss:
         Rise of the weighted sum of squares on the fitted runs.
     size : int
         Number of unknowns of the effect.
-    scale : float
-        Variance of the samples' noise along the change by the effect, over that of white noise,
-        times the dispersion of the residual; of transients the colour of the residual, by which
-        effects are taken on trial.
     price : float
         Price of one unknown, in units of the scale.
-    noise : float
-        Variance of the rise over that in white noise of the samples.
-    freedom : int
-        Degrees of freedom with which this is known; zero where it is assumed.
+    noise : Inflation
+        Variance of the rise over that in white noise of the samples, times the dispersion of the
+        residual.
     """
 
     step: AddedEffect
     rise: float
     size: int
-    scale: float
     price: float
-    noise: float
-    freedom: int
+    noise: Inflation
+
+    @property
+    def scale(self) -> float:
+        """Unit of the rise; of transients that by which effects are taken on trial."""
+        return self.noise.on_trial
 
     @property
     def worth(self) -> float:
@@ -92,7 +90,7 @@ class Loss:
         return self.rise / self.scale - self.price * self.size
 
     def __str__(self) -> str:
-        error = fall_error(self.rise, self.size, self.noise)
+        error = fall_error(self.rise, self.size, self.noise.value)
         unknowns = "its unknown is" if self.size == 1 else f"its {self.size} unknowns are"
         return (
             f"without it the weighted squared error on fitted runs rises by"
@@ -186,7 +184,7 @@ def plainly_needed(
     distance = squared_distance(point.theta[index], covariance)
     factor = 1.0 if just_added else base.policy.plainly_needed
     enough = factor * schwarz_price(base) * len(index)
-    if distance > enough and not all(record.periodic for record in state.fit.records):
+    if distance > enough and not state.fit.all_periodic:
         known = colour_of(state.fit, [names[k] for k in index])
         distance = 0.0 if known is None else distance / max(known[0], 1.0)
     return bool(distance > enough)
@@ -207,17 +205,16 @@ def compared_without(
     names = [n for n in base.fit.problem.names if n not in fit.problem.names]
     measured = inflation_along(base, base.fit, names, changes)
     found, spread = Inflation(1.0, 0) if measured is None else measured, dispersion(base)
-    scale = (found.value if found.colour is None else found.colour) * spread
+    noise = Inflation(found.value * spread, found.freedom, found.on_trial * spread)
     # The logarithm is that of the effective number of independent samples.
-    price = max(schwarz_price(base) - float(np.log(scale)), 1.0)
-    rise, noise = -share * base.fall_back, found.value * spread
-    return Loss(step, rise, len(names), scale, price, noise, found.freedom), fit
+    price = max(schwarz_price(base) - float(np.log(noise.on_trial)), 1.0)
+    return Loss(step, -share * base.fall_back, len(names), price, noise), fit
 
 
 def dispersion(base: Base) -> float:
     """Mean square of the residual of periodic runs over that of the noise, at least one. For
     transients it is one, because their inflation holds it."""
-    if not all(record.periodic for record in base.fit.records) or not base.excess > base.feigned:
+    if not base.fit.all_periodic or not base.excess > base.feigned:
         return 1.0
     return 1.0 + base.excess / max(base.noise, 1e-300)
 

@@ -280,6 +280,11 @@ class ModelFit:
         """The fitted runs."""
         return self.predictor.records
 
+    @property
+    def all_periodic(self) -> bool:
+        """Whether no fitted run is a transient."""
+        return all(record.periodic for record in self.records)
+
     def apart(self) -> ModelFit:
         """The same with solvers of its own: they stay at this estimate, wherever the others go."""
         predictor = copy(self.predictor)

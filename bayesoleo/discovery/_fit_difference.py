@@ -44,7 +44,7 @@ def undecided(base: Base, one: Refit, other: Refit) -> float:
     noise, length = noise_between(base, one.fit, other.fit)
     better, policy = max(one, other, key=lambda item: item.fall), one.policy
     likely = policy.equal_likelihood * noise
-    if better.reached or all(record.periodic for record in base.fit.records):
+    if better.reached or base.fit.all_periodic:
         return likely
     return max(likely, policy.both_wrong_errors * 2.0 * float(np.sqrt(noise * length)))
 
@@ -71,7 +71,7 @@ def noise_between(base: Base, one: ModelFit, other: ModelFit) -> tuple[float, fl
     length = sum(float(np.sum(part**2)) for part in changes)
     if not (np.isfinite(length) and length > 0.0):
         return 1.0, 0.0
-    if all(record.periodic for record in base.fit.records):
+    if base.fit.all_periodic:
         return _of_periodic(base, better, changes), length
     pairs = zip(changes, better, strict=True)
     along = sum(noise_along(change, left) for change, left in pairs)

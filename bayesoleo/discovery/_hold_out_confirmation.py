@@ -20,6 +20,7 @@ from bayesoleo._types import Array, ProgressCallback
 from bayesoleo.data._noise import NoiseSpectrum
 from bayesoleo.discovery._assembly import Roles, in_halves
 from bayesoleo.discovery._fit import Numerics, weights
+from bayesoleo.discovery._fit_and_hold_out_error import RunError
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._refit import Refit, noise_of_fit
@@ -190,7 +191,7 @@ def _known_to(state: State, other: State, pull: Array, inflation: float) -> floa
     if not np.isfinite(covariance).all():
         return 0.0
     white = max(float(pull @ covariance @ pull), 0.0)
-    if not pull.any() or all(record.periodic for record in state.fit.records):
+    if not pull.any() or state.fit.all_periodic:
         return inflation * white
     mine = noise_of_fit(state.fit)
     level = float(np.mean(other.fit.point.variance / state.fit.point.variance))
@@ -213,40 +214,86 @@ class _RunFall:
     inflation: float
 
 
+@dataclass(frozen=True)
+class _Changed:
+    """What an effect changes of one output in one run.
+
+    Parameters
+    ----------
+    entry : RunError
+        The error without it.
+    change, left : ndarray, shape (N,)
+        Of the prediction, and what the model with it leaves, SI; zero where samples do not count.
+    pulled : ndarray, shape (k,)
+        Derivative of the fall by the errors of the input, halved.
+    """
+
+    entry: RunError
+    change: Array
+    left: Array
+    pulled: Array
+
+    @property
+    def weight(self) -> float:
+        """One over the variance of a sample's noise."""
+        return float(self.entry.average.sigma**-2)
+
+    @property
+    def size(self) -> float:
+        """Squared change in units of the noise."""
+        return self.weight * float(self.change @ self.change)
+
+    @property
+    def fall(self) -> float:
+        """Of the weighted sum of squares."""
+        return self.weight * float(np.sum((self.left + self.change) ** 2 - self.left**2))
+
+
 def _of_run(
     before: State, after: State, old: Prediction, new: Prediction, inflation: float
 ) -> _RunFall:
-    predictor, record = old.predictor, old.record
-    columns = input_columns(predictor.runs[0], predictor.constants(old.vector[None], 0)[0])
-    fall = expected = noise = remainder = 0.0
-    moved: Array | float = 0.0
-    scaled = []
-    for b, output in enumerate(new.predictor.outputs):
-        entry = before.hold_errors.at(output, record.label)
-        weight = entry.average.sigma**-2
-        counts = weights(record)
-        left = (record.samples[output] - new.y[b]) * counts
-        change = (new.y[b] - old.y[b]) * counts
-        size = weight * float(change @ change)
-        fall += weight * float(np.sum(((left + change) ** 2 - left**2) * counts))
-        expected += size
-        pulled = weight * entry.input_scale * (columns[b] @ change)
-        moved = moved + pulled
-        along = max(inflation * size, weight**2 * _between_harmonics(entry.spectrum, change))
-        own = along + float(np.sum(np.square(pulled)))
-        noise += along
-        scaled.append((change / entry.average.sigma, left / entry.average.sigma))
-        if record.periodic and not after.at_floor:
-            ratio = after.hold_errors.at(output, record.label).ratio_to_expected
-            spread = max(ratio**2 - 1.0, 0.0) * own
-            remainder += min(spread, weight**2 * surrogate_variance(change, left))
-    variance = noise + float(np.sum(np.square(moved))) + remainder
-    if not record.periodic:
-        changes, rests = (np.array(rows) for rows in zip(*scaled, strict=True))
-        white = float(np.sum(np.square(moved)))
-        variance = max(_between_models(changes, rests), expected + white)
+    record, changed = old.record, _changed(before, old, new)
+    fall, expected = sum(one.fall for one in changed), sum(one.size for one in changed)
+    moved = sum((one.pulled for one in changed), np.zeros(1))
+    by_input = float(np.sum(np.square(moved)))
+    if record.periodic:
+        parts = [_of_periodic(one, after, record.label, inflation) for one in changed]
+        variance = sum(parts) + by_input
+    else:
+        sigmas = [one.entry.average.sigma for one in changed]
+        changes, rests = (
+            np.array([values / sigma for values, sigma in zip(rows, sigmas, strict=True)])
+            for rows in ([one.change for one in changed], [one.left for one in changed])
+        )
+        variance = max(_between_models(changes, rests), expected + by_input)
         inflation = variance / expected if expected > 0 else 1.0
     return _RunFall(fall, expected, 4.0 * variance, inflation)
+
+
+def _changed(before: State, old: Prediction, new: Prediction) -> list[_Changed]:
+    predictor, record = old.predictor, old.record
+    columns = input_columns(predictor.runs[0], predictor.constants(old.vector[None], 0)[0])
+    counts, found = weights(record), []
+    for b, output in enumerate(new.predictor.outputs):
+        entry = before.hold_errors.at(output, record.label)
+        change = (new.y[b] - old.y[b]) * counts
+        left = (record.samples[output] - new.y[b]) * counts
+        pulled = entry.average.sigma**-2 * entry.input_scale * (columns[b] @ change)
+        found.append(_Changed(entry, change, left, pulled))
+    return found
+
+
+def _of_periodic(one: _Changed, after: State, run: str, inflation: float) -> float:
+    """Variance of the fall of one output in a periodic run, a quarter of it, without what outputs
+    share: by its noise and the error that still repeats."""
+    weight, change, left = one.weight, one.change, one.left
+    noise = max(inflation * one.size, weight**2 * _between_harmonics(one.entry.spectrum, change))
+    if after.at_floor:
+        return noise
+    own = noise + float(np.sum(np.square(one.pulled)))
+    ratio = after.hold_errors.at(one.entry.output, run).ratio_to_expected
+    spread = max(ratio**2 - 1.0, 0.0) * own
+    return noise + min(spread, weight**2 * surrogate_variance(change, left))
 
 
 def _between_harmonics(spectrum: NoiseSpectrum | None, change: Array) -> float:
@@ -333,7 +380,7 @@ def confirmed(
         other = fall_on_hold_out(*pair, result.inflation)
         fall = fall.and_by(other)
         where += f", which hardly shows it, and by {other} on the second half of fitted ones"
-    tried = on_trial and not all(record.periodic for record in state.fit.records)
+    tried = on_trial and not state.fit.all_periodic
     if tried and fall.may_be_tried and not fall.confirms:
         return after, f"{_explains(item)}; it is added on trial, because on {where}"
     if not fall.confirms:

@@ -69,11 +69,11 @@ class Evidence:
     @property
     def p(self) -> float:
         """The p-value on the fitted runs, corrected for the search."""
-        loss = self.loss
-        if loss.freedom:
-            local = stats.f.sf(loss.rise / loss.noise / loss.size, loss.size, loss.freedom)
+        loss, noise = self.loss, self.loss.noise
+        if noise.freedom:
+            local = stats.f.sf(loss.rise / noise.value / loss.size, loss.size, noise.freedom)
         else:
-            local = stats.chi2.sf(loss.rise / loss.noise, loss.size)
+            local = stats.chi2.sf(loss.rise / noise.value, loss.size)
         return float(-np.expm1(self.tests * np.log1p(-min(local, 1 - 1e-16))))
 
     @property
@@ -117,7 +117,7 @@ def judged_together(
     callback : callable
         Receives a message at each step.
     """
-    if all(record.periodic for record in state.fit.records):
+    if state.fit.all_periodic:
         return state
     notes[:] = [note for note in notes if not note.startswith(TOGETHER)]
     while chosen := [step for step in state.assembly.steps if step.effect.family != FAMILY]:
@@ -156,7 +156,7 @@ def _evidence(
         fall = None
         if state.hold_errors.entries and np.isfinite(loss.rise):
             before = state_of(state.assembly.without(step), fit, roles)
-            fall = fall_on_hold_out(*judged(before, state), loss.noise)
+            fall = fall_on_hold_out(*judged(before, state), loss.noise.value)
         declared = roles.strategy == "declared"
         found.append(Evidence(loss, fall, tests, declared, state.policy))
     return [one for one in found if one.is_known]

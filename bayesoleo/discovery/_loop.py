@@ -493,7 +493,7 @@ def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
     notes += [f"could not be predicted: run {text}" for text in state.unsolved]
     notes += state.too_quiet
     judged = any(note.startswith(TOGETHER) for note in notes)
-    periodic = all(record.periodic for record in state.fit.records)
+    periodic = state.fit.all_periodic
     if progress.broken and state.assembly.steps and not (periodic or judged):
         notes.append(UNJUDGED)
     if not state.at_floor:

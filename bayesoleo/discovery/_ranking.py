@@ -235,7 +235,7 @@ class Ranked:
         Its estimate beside the other effects of the final model, where these have changed since
         it was added.
     p_on_trial : float or None
-        The p-value by which it is taken on trial; see :attr:`Refit.trial`.
+        The p-value by which it is taken on trial; see :attr:`Inflation.on_trial`.
     """
 
     score: Score
@@ -371,11 +371,12 @@ def rank(
 
 def estimated(score: Score, fitted: Refit) -> Score:
     """A score with the estimated values in place of those expected at the null."""
-    return replace(score, fall=fitted.fall, inflation=fitted.inflation, freedom=fitted.freedom)
+    noise = fitted.noise
+    return replace(score, fall=fitted.fall, inflation=noise.value, freedom=noise.freedom)
 
 
 def _on_trial(score: Score, fitted: Refit) -> Score:
-    return replace(estimated(score, fitted), inflation=fitted.trial)
+    return replace(estimated(score, fitted), inflation=fitted.noise.on_trial)
 
 
 def _same(

@@ -34,6 +34,36 @@ STARTS = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 64, 1 / 256)
 
 
 @dataclass(frozen=True)
+class Inflation:
+    """How much more an effect's part of the noise varies than white noise of the samples would.
+
+    Parameters
+    ----------
+    value : float
+        Of the sum of squares in units of the samples' noise, at least one.
+    freedom : int
+        Degrees of freedom with which it is known; zero where it is assumed.
+    colour : float, optional
+        Of the unknowns, over what the residual gives if it is taken for white; by default the
+        same.
+    """
+
+    value: float
+    freedom: int
+    colour: float | None = None
+
+    @property
+    def on_trial(self) -> float:
+        """By which an effect is taken on trial: the colour alone.
+
+        In a transient, slow noise and the error of the model look alike. Of several missing effects
+        each leaves the others, and beside them none would be significant. They are judged when what
+        is left is known: in the final model, beside each other.
+        """
+        return self.value if self.colour is None else self.colour
+
+
+@dataclass(frozen=True)
 class Refit:
     """An extended model after estimation.
 
@@ -52,11 +82,9 @@ class Refit:
     remaining : float
         Remaining sum of squares beyond that of the noise, plus the excess that noise alone can
         cause.
-    inflation : float
+    noise : Inflation
         Variance of the fall of the sum of squares over what white noise gives, where noise is
         coloured or, in a transient, larger than differences of neighbouring samples show.
-    freedom : int
-        Degrees of freedom of the inflation; zero where it is that of the score.
     fall : float
         Fall of the weighted sum of squares.
     reached : bool
@@ -67,9 +95,6 @@ class Refit:
     policy : SearchPolicy
     feigned : float
         Excess that noise alone can cause.
-    colour : float, optional
-        Variance of the new amplitudes over that of the fit, which takes what is left for white; by
-        default the inflation.
     """
 
     score: Score
@@ -78,14 +103,17 @@ class Refit:
     share: float
     contribution: Array
     remaining: float
-    inflation: float
-    freedom: int
+    noise: Inflation
     fall: float
     reached: bool
     price: float
     policy: SearchPolicy = SearchPolicy()
     feigned: float = 0.0
-    colour: float | None = None
+
+    @property
+    def inflation(self) -> float:
+        """Variance of the fall of the sum of squares over what white noise gives."""
+        return self.noise.value
 
     def resembles(self, other: Refit, undecided: float | None = None) -> bool:
         """Whether the data cannot distinguish two estimated effects.
@@ -148,7 +176,7 @@ class Refit:
         """Whether the effect leaves only noise and clearly beats an effect that was only scored."""
         mine, its = (one.fall - self.price * one.size for one in (self.score, other))
         # Scored in transients, the other one's inflation holds the level of what it leaves.
-        inflation = max(self.inflation, other.inflation if self.colour is None else 1.0)
+        inflation = max(self.inflation, other.inflation if self.noise.colour is None else 1.0)
         return self.reached and mine - its > self.policy.equal_likelihood * inflation
 
     @property
@@ -161,16 +189,6 @@ class Refit:
         """Fall of the sum of squares beyond the price of the unknowns."""
         return self.fall - self.price * self.size
 
-    @property
-    def trial(self) -> float:
-        """Inflation by which an effect is taken on trial: the colour alone.
-
-        In a transient, slow noise and the error of the model look alike. Of several missing effects
-        each leaves the others, and beside them none would be significant. They are judged when what
-        is left is known: in the final model, beside each other.
-        """
-        return self.inflation if self.colour is None else self.colour
-
     def excludes_null(self) -> bool:
         """Whether the new amplitudes' posterior, by its Laplace approximation, excludes the null.
 
@@ -182,21 +200,21 @@ class Refit:
         851-853).
         """
         level, price = self.policy.excluded_null, self.policy.excluded_price * self.price
-        if self.fall / self.trial > price * self.size:
+        if self.fall / self.noise.on_trial > price * self.size:
             return True
         names = [name for name in self.fit.problem.names if name in self.score.names]
         index = [self.fit.problem.names.index(name) for name in names]
         value = self.fit.point.theta[index]
         # Coloured noise, measured by its scatter between periods, widens the white covariance.
         white = self.fit.point.covariance[np.ix_(index, index)]
-        covariance = white * self.trial
+        covariance = white * self.noise.on_trial
         if not np.isfinite(covariance).all():
             return False
-        free = self.freedom or np.inf
+        free = self.noise.freedom or np.inf
         if len(index) == 1:
             return bool(stats.t.cdf(abs(value[0]) / np.sqrt(covariance[0, 0]), free) >= level)
         distance = squared_distance(value, covariance)
-        if self.freedom:
+        if self.noise.freedom:
             return bool(stats.f.cdf(distance / len(index), len(index), free) >= 2 * level - 1)
         return bool(stats.chi2.cdf(distance, len(index)) >= 2 * level - 1)
 
@@ -248,8 +266,8 @@ def refit_at(base: Base, score: Score, assembly: Assembly, fit: ModelFit) -> Ref
     reached = base.excess - fall < base.feigned
     price = schwarz_price(base)
     return Refit(
-        score, grown, fit, share, contribution, remaining, noise.value, noise.freedom, fall,
-        reached, price, base.policy, base.feigned, noise.colour,
+        score, grown, fit, share, contribution, remaining, noise, fall, reached, price,
+        base.policy, base.feigned,
     )  # fmt: skip
 
 
@@ -273,26 +291,6 @@ def records_of(shared: tuple[Base, *tuple[Any, ...]]) -> Sequence[Record]:
 def schwarz_price(base: Base) -> float:
     """Price of an unknown in the sum of squares: the logarithm of the number of samples."""
     return float(np.log(sum(run.residual.size for run in base.runs)))
-
-
-@dataclass(frozen=True)
-class Inflation:
-    """How much more an effect's part of the noise varies than white noise of the samples would.
-
-    Parameters
-    ----------
-    value : float
-        Of the sum of squares in units of the samples' noise, at least one.
-    freedom : int
-        Degrees of freedom with which it is known; zero where it is assumed.
-    colour : float, optional
-        Of the unknowns, over what the residual gives if it is taken for white; by default the
-        same.
-    """
-
-    value: float
-    freedom: int
-    colour: float | None = None
 
 
 def inflation_along(
@@ -323,7 +321,7 @@ def inflation_along(
     """
     if not all(np.isfinite(change).all() for change in changes):
         return None
-    if all(record.periodic for record in fit.records):
+    if fit.all_periodic:
         return Inflation(*inflation_of(base, changes))
     known = colour_of(fit, names)
     if known is None:

@@ -323,7 +323,11 @@ def on_one_run(change, left, *, ratio, inflation=1.0, periodic=True):
         label="a", samples={"y": samples}, kept=None, time=np.arange(left.size), periodic=periodic
     )
     entry = SimpleNamespace(
-        average=SimpleNamespace(sigma=0.5), input_scale=1.0, ratio_to_expected=ratio, spectrum=None
+        output="y",
+        average=SimpleNamespace(sigma=0.5),
+        input_scale=1.0,
+        ratio_to_expected=ratio,
+        spectrum=None,
     )
     state = SimpleNamespace(hold_errors=SimpleNamespace(at=lambda *_: entry), at_floor=False)
     predictor = SimpleNamespace(outputs=("y",), runs=[None], constants=lambda *_: np.zeros((1, 1)))
@@ -385,7 +389,7 @@ def test_errors_of_the_parameters_move_a_fall_by_twice_their_pull(monkeypatch):
         fit = SimpleNamespace(
             problem=SimpleNamespace(names=names),
             point=SimpleNamespace(covariance=known),
-            records=[SimpleNamespace(periodic=True)],
+            all_periodic=True,
         )
         return SimpleNamespace(held_out=[prediction], fit=fit, policy=SearchPolicy())
 

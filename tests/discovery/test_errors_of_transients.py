@@ -101,8 +101,7 @@ def models(residuals, *, reached=False):
     """Two estimated effects and what both were estimated against, by what they leave of one run."""
     measured = np.zeros((1, residuals[0].size))
     run = SimpleNamespace(scale=np.ones(residuals[0].size))
-    record = SimpleNamespace(periodic=False)
-    base = SimpleNamespace(runs=[run], fit=SimpleNamespace(records=[record]))
+    base = SimpleNamespace(runs=[run], fit=SimpleNamespace(all_periodic=False))
     made = []
     for left in residuals:
         fit = SimpleNamespace(

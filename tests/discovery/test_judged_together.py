@@ -18,7 +18,7 @@ from bayesoleo.discovery._judged_together import TOGETHER, Evidence, judged_toge
 from bayesoleo.discovery._loop import UNJUDGED, loop_of
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import Ranked
-from bayesoleo.discovery._refit import new_parameters, refit
+from bayesoleo.discovery._refit import Inflation, new_parameters, refit
 from bayesoleo.discovery._round import Progress, Round
 from bayesoleo.discovery._score_tests import corrected_p, score_all
 from bayesoleo.discovery._state import State, fit_state
@@ -62,9 +62,9 @@ def test_the_inflation_of_a_transient_holds_colour_and_level(tmp_path, coloured)
         score = score_all(base, options(state, ["quadratic_damping"]), jobs=1)[0][0]
         result = refit(base, score, NUMERICS)
         shown = np.mean([entry.average.sigma**2 for entry in state.fit_errors.entries])
-        assert result.inflation / result.trial == pytest.approx(1.0 / shown, rel=0.35)
+        assert result.inflation / result.noise.on_trial == pytest.approx(1.0 / shown, rel=0.35)
         ratios.append(result.fall / result.inflation)
-        tried.append(result.fall / result.trial)
+        tried.append(result.fall / result.noise.on_trial)
     # Six chi-square variates of one degree of freedom, about as known as noise is from few lines.
     assert np.mean(ratios) < 3.0
     if coloured:
@@ -83,7 +83,7 @@ def test_an_effect_is_tried_by_one_p_value_and_stated_with_the_other():
 
 
 def evidence(value, rise, *, declared=True, held_out=True, freedom=20):
-    loss = Loss(STEP, rise, 2, 3.0, 2.0, 10.0, freedom)
+    loss = Loss(STEP, rise, 2, 2.0, Inflation(10.0, freedom, 3.0))
     return Evidence(loss, Fall(value, 100.0, 500.0) if held_out else None, 12.0, declared)
 
 
@@ -92,7 +92,7 @@ def test_declared_runs_decide_by_the_errors_that_the_policy_asks_for():
     assert evidence(200.0, 0.0).missing < 0.0
     assert evidence(-50.0, 1e6).missing > evidence(150.0, 1e6).missing
     # As small as the fall of a superfluous unknown: not confirmed, however sure.
-    loss = Loss(STEP, 1e6, 2, 3.0, 2.0, 10.0, 20)
+    loss = Loss(STEP, 1e6, 2, 2.0, Inflation(10.0, 20, 3.0))
     assert Evidence(loss, Fall(2.0, 0.1, 2.0), 12.0, declared=True).missing > 0.0
 
 
@@ -163,8 +163,7 @@ def test_what_slow_noise_feigns_is_not_plainly_needed(tmp_path):
 
 
 def _as_periodic(state: State):
-    records = [SimpleNamespace(periodic=True)]
-    fit = SimpleNamespace(point=state.fit.point, problem=state.fit.problem, records=records)
+    fit = SimpleNamespace(point=state.fit.point, problem=state.fit.problem, all_periodic=True)
     return SimpleNamespace(fit=fit), state.base()
 
 
@@ -176,10 +175,10 @@ def test_p_values_of_absent_effects_in_slow_noise_are_seldom_small(tmp_path):
         base = state.base()
         for score in score_all(base, options(state, ["quadratic_damping"]), jobs=1)[0]:
             result = refit(base, score, NUMERICS)
-            noise = {"fall": result.fall, "freedom": result.freedom}
+            noise = {"fall": result.fall, "freedom": result.noise.freedom}
             stated = replace(score, inflation=result.inflation, **noise)
             small += corrected_p(stated, 1.0) < 0.05
-            tried += corrected_p(replace(stated, inflation=result.trial), 1.0) < 0.05
+            tried += corrected_p(replace(stated, inflation=result.noise.on_trial), 1.0) < 0.05
     assert small <= 2  # of eight at 5 %, three or more with a probability of 0.6 %
     assert tried >= 5
 
@@ -237,7 +236,7 @@ def test_a_quiet_run_tells_as_much_as_it_does(tmp_path):
         score = score_all(state.base(), options(state, ["quadratic_damping"]), jobs=1)[0][0]
         result = refit(state.base(), score, NUMERICS)
         stated.append(result.inflation)
-        assert result.trial >= 1.0
+        assert result.noise.on_trial >= 1.0
     # Weights of the fit are common, so that noise of the loud runs counts, but not a thousandfold.
     assert np.median(stated) < 400.0
 

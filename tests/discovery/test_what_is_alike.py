@@ -10,7 +10,7 @@ from small_campaigns import damper
 
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import Ranked
-from bayesoleo.discovery._refit import Refit
+from bayesoleo.discovery._refit import Inflation, Refit
 from bayesoleo.discovery._round import _only_absorbs
 from bayesoleo.model._drive_and_start import driven_by
 from bayesoleo.model._kernels import kernels
@@ -35,7 +35,8 @@ def estimated(
     fit = SimpleNamespace(
         problem=SimpleNamespace(names=("amplitude",)), point=SimpleNamespace(theta=(value,))
     )
-    return Refit(score, None, fit, 0.5, contribution, remaining, 1.0, 0, fall, reached, PRICE)
+    noise = Inflation(1.0, 0)
+    return Refit(score, None, fit, 0.5, contribution, remaining, noise, fall, reached, PRICE)
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.1])
