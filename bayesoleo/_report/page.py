@@ -37,7 +37,7 @@ from bayesoleo.effects._catalogue import called, listed, parameter_called
 from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.errors import InputError, ResultsError
 from bayesoleo.plots import _reading as reading
-from bayesoleo.plots._discovery import chosen, format_p, format_share, name
+from bayesoleo.plots._discovery import chosen, format_share, name
 from bayesoleo.plots._residuals import has_excess
 
 #: A harmonic or a coordinate is named if it holds this part of the excess.
@@ -142,7 +142,7 @@ def _what(summary: Mapping[str, Any]) -> Iterator[str]:
         if added["effect"] not in summary["effects"]:
             yield f"{which} was added first, and removed again."
             continue
-        p = format_p(added["p_value"])
+        p = sentences.significance(added)
         text = f"{which} explains {_share(added)} of the excess"
         text += (
             f" ({p}, corrected for the search of {len(entry['candidates'])} candidates)"

@@ -40,6 +40,18 @@ def role_shown(summary: Mapping[str, Any]) -> str:
     return schema.HOLD_OUT if summary["error_after"].get(schema.HOLD_OUT) else schema.FIT
 
 
+def significance(added: Mapping[str, Any]) -> str:
+    """The p-value of an effect that was added; empty where there is none.
+
+    One that was added while others were missing may be significant only beside those that followed:
+    its own p-value is then that beside what the model had before.
+    """
+    p = format_p(added["p_value"])
+    if not p or added["p_value"] < SearchPolicy().significance:
+        return p
+    return f"{p} on the fitted runs, beside what the model had until then"
+
+
 def headline(summary: Mapping[str, Any]) -> str:
     """The result as a sentence, which begins with how sure it is."""
     broken = any(item["stage"] == "search" for item in summary.get(schema.UNFINISHED, []))

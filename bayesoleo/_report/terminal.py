@@ -18,7 +18,7 @@ from bayesoleo._report.structures import proposal_lines
 from bayesoleo._storage.files import write_text_atomic
 from bayesoleo._types import Array
 from bayesoleo.effects._catalogue import called, listed
-from bayesoleo.plots._discovery import chosen, format_p, name
+from bayesoleo.plots._discovery import chosen, name
 
 _PAGE = """<!DOCTYPE html>
 <html lang="en">
@@ -138,7 +138,7 @@ def _accepted(number: int, entry: Mapping[str, Any], titles: Mapping[str, str]) 
     added = chosen(entry)
     if added is None:
         return Text(f"Round {number}: {called(entry['accepted'], titles)} added")
-    p = format_p(added["p_value"])
+    p = sentences.significance(added)
     share = f"{100 * added['gain']:.0f} % of the excess"
     which = called(name(added), titles)
     text = Text.assemble(f"Round {number}: ", (which, "bold"), f" explains {share}")

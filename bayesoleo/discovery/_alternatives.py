@@ -153,7 +153,7 @@ def eliminated(
             why = "its estimate led the model without it to a better optimum, and it is not needed"
         notes.append(f"{effect} was removed again because {why}: {least}")
         assembly = state.assembly.without(least.step)
-        start = start_from(base, base.fit.values, assembly.model())
+        start = start_from(base.fit, base.fit.values, assembly.model())
         state = fit_state(assembly, roles, numerics, start=start, progress=callback)
     return state
 

@@ -136,7 +136,7 @@ def judged_together(
             f" confirmed, since {worst}"
         )
         assembly = state.assembly.without(worst.loss.step)
-        start = start_from(base, base.fit.values, assembly.model())
+        start = start_from(base.fit, base.fit.values, assembly.model())
         state = fit_state(assembly, roles, numerics, start=start, progress=callback)
     return state
 

@@ -451,9 +451,9 @@ def quick_fit(
         model,
         base.fit.records,
         quick,
-        start=start_from(base, known, model)
+        start=start_from(base.fit, known, model)
         if isinstance(known, Mapping)
-        else np.array([start_from(base, one, model) for one in known]),
+        else np.array([start_from(base.fit, one, model) for one in known]),
         tolerance=1e-4,
         max_iterations=15,
         share=base.fit.predictor,
@@ -463,9 +463,9 @@ def quick_fit(
     )
 
 
-def start_from(base: Base, known: Mapping[str, float], model: Model) -> Array:
+def start_from(fit: ModelFit, known: Mapping[str, float], model: Model) -> Array:
     """Known values inside the priors' support, and else nominal ones."""
-    layout = Layout.of(model, [record.label for record in base.fit.records])
+    layout = Layout.of(model, [record.label for record in fit.records])
     start = layout.start(model)
     priors = layout.priors(model)
     for k, name in enumerate(layout.names):

@@ -29,7 +29,15 @@ from bayesoleo.discovery._ranking import (
     rank,
     score_candidates,
 )
-from bayesoleo.discovery._refit import Refit, fall_from, records_of, refit, refit_all, refit_at
+from bayesoleo.discovery._refit import (
+    Refit,
+    fall_from,
+    records_of,
+    refit,
+    refit_all,
+    refit_at,
+    start_from,
+)
 from bayesoleo.discovery._round import Progress, Round
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score
@@ -254,7 +262,9 @@ def place_of(
     if len(less.steps) != len(final.assembly.steps) - 1:
         return None  # other effects change the terms of this one
     fitted = replace(roles, held_out=(), strategy="none")
-    without = fit_state(less, fitted, replace(numerics, steps=final.fit.steps))
+    # What the priors hardly allow was looked at when the effect was added: no draws from them.
+    start = start_from(final.fit, final.fit.values, less.model())
+    without = fit_state(less, fitted, replace(numerics, steps=final.fit.steps), start=start)
     if not all(np.isfinite(run.y).all() for run in without.fit.predictions):
         return None  # a run has no solution there, and nothing can be scored
     base = without.base()
@@ -355,7 +365,8 @@ def _replaced(
 ) -> Progress | None:
     """The search with another effect in a place, unless the hold-out runs contradict it."""
     final = progress.state
-    before = fit_state(final.assembly.without(step), roles, numerics)
+    start = place.base.fit.point.theta
+    before = fit_state(final.assembly.without(step), roles, numerics, start=start)
     assert better.refit is not None
     assert place.own.refit is not None
     after, reason = confirmed(before, better, better.refit, roles, numerics, callback)

@@ -34,7 +34,7 @@ def test_what_is_slow_is_averaged_over_two_hundredths_of_the_record():
     assert samples_in_average([slow]) == SAMPLES // MOST_AVERAGES
     # The fastest signal decides, and noise is none.
     rng = np.random.default_rng(3)
-    noisy = slow + 0.05 * rng.standard_normal(SAMPLES)
+    noisy = slow + 0.3 * rng.standard_normal(SAMPLES)
     assert samples_in_average([noisy]) > SAMPLES // MOST_AVERAGES // 2
     fast = np.sin(2 * np.pi * PLACE / 30.0)
     assert samples_in_average([slow, fast]) == 3

@@ -82,3 +82,13 @@ def test_nothing_wrong_is_said_so(answers, two_runs):
     assert found["Was anything wrong?"].startswith("No: no error is larger than chance allows")
     assert "What is it?" not in found
     assert "Does it hold on data not used?" not in found
+
+
+@pytest.mark.parametrize(("p", "alone"), [(0.59, False), (0.001, True)])
+def test_a_p_value_that_added_nothing_says_beside_what_it_stands(answers, oleo, p, alone):
+    """An effect of transients is added on trial, and confirmed beside those that follow."""
+    trial = json.loads(json.dumps(answers[1]))
+    for candidate in trial["rounds"][0]["candidates"]:
+        candidate["p_value"] = p
+    told = dict(case(trial, {}, oleo))["What is it?"]
+    assert ("beside what the model had until then" not in told) == alone
