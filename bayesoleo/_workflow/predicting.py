@@ -23,9 +23,12 @@ from bayesoleo._types import Array, Float
 from bayesoleo._workflow.simulating import model_of, parameter_sets, same_noise, same_samples
 from bayesoleo.assessment._residual_breakdown import judged_errors
 from bayesoleo.assessment._residual_tests import PredictiveScore, score_draws
+from bayesoleo.data._noise import local_means
 from bayesoleo.data._reduction import ReducedCampaign
+from bayesoleo.discovery._expected_error import most_by_chance
 from bayesoleo.discovery._fit import weights
-from bayesoleo.discovery._fit_and_hold_out_error import averages_of, compared
+from bayesoleo.discovery._fit_and_hold_out_error import compared
+from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._run_predictions import Prediction
 from bayesoleo.errors import InputError, check_level
 from bayesoleo.estimation._baselines import (
@@ -301,12 +304,13 @@ def _errors(
     status = Status(int(at_estimate.status[0]))
     one = Prediction(record, at_estimate.y[0], values, 0, status, predictor)
     entries, _ = compared(one, {record.label: record.role})
-    changes = (draws - at_estimate.y[0]) * weights(record)
-    if not record.periodic:
-        changes = averages_of(record, predictor.outputs, changes)
-    moved = np.mean(changes**2, axis=(0, 2))
+    raw = (draws - at_estimate.y[0]) * weights(record)
+    averaged = raw if record.periodic else local_means(raw)
+    moved, of_samples = (np.mean(changes**2, axis=(0, 2)) for changes in (averaged, raw))
     found = []
-    for entry, square in zip(entries, moved, strict=True):
+    for one_output, square, single in zip(entries, moved, of_samples, strict=True):
+        by_draws = most_by_chance(float(single), SearchPolicy())
+        entry = replace(one_output, feigned=one_output.feigned + by_draws)
         expected = float(np.hypot(entry.noise, np.sqrt(square)))
         found.append(
             {

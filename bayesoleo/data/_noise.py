@@ -21,7 +21,6 @@ and 3.5; Satterthwaite (1946), Biometrics Bulletin 2(6), 110-114, for degrees of
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import comb
@@ -38,11 +37,8 @@ from bayesoleo.errors import InputError
 #: sensible sampling.
 HIGHEST_DIFFERENCE = 8
 
-#: Averages of a run, and samples in one where the motion is slow.
+#: Averages of a run, and samples in one at least.
 MOST_AVERAGES, FEWEST_SAMPLES = 200, 4
-#: Averages in the shortest period of a motion, and the part of its power that is at longer ones. An
-#: average keeps 95 % of the power at that period, and two thirds at a third of it.
-IN_A_PERIOD, SLOWER = 8, 0.99
 #: Lines that are averaged lie within this many periods' worth of lines, or this part of the
 #: frequency, whichever is wider: one harmonic on either side where noise may be steep.
 HARMONICS, PART = 1.0, 0.25
@@ -51,7 +47,7 @@ HARMONICS, PART = 1.0, 0.25
 AT_MEAN = 0.5
 
 
-def innovation_noise(values: Array) -> float:
+def innovation_noise(values: Array, kept: NDArray[np.bool_] | None = None) -> float:
     """Standard deviation of white noise on a smooth signal (variate differences, Tintner 1940).
 
     Differences of order d remove a local polynomial of degree d - 1 and leave noise with variance
@@ -61,21 +57,30 @@ def innovation_noise(values: Array) -> float:
     ----------
     values : ndarray, shape (N,)
         Signal at equidistant times.
+    kept : ndarray of bool, shape (N,), optional
+        Samples that count: what bridges the others is smooth, and would hide the noise. Where too
+        few stand in a row, all count.
 
     Returns
     -------
     float
         In the signal's unit.
     """
-    difference, estimate = np.diff(values, 2), np.inf
+    whole = np.ones(values.size, dtype=bool) if kept is None else kept
+    difference, estimate, latest = np.diff(values, 2), np.inf, np.inf
+    valid = whole[2:] & whole[1:-1] & whole[:-2]
     for order in range(2, HIGHEST_DIFFERENCE + 1):
-        latest = float(np.sqrt(np.mean(difference**2) / comb(2 * order, order)))
+        used = difference if kept is None else difference[valid]
+        if kept is not None and used.size < 8:
+            break
+        latest = float(np.sqrt(np.mean(used**2) / comb(2 * order, order)))
         # Two per cent is within the scatter of the estimate for a few thousand samples.
-        if difference.size < 8 or latest > 0.98 * estimate:
+        if used.size < 8 or latest > 0.98 * estimate:
             break
         estimate = latest
-        difference = np.diff(difference)
-    return min(estimate, latest)
+        difference, valid = np.diff(difference), valid[1:] & valid[:-1]
+    found = min(estimate, latest)
+    return found if np.isfinite(found) or kept is None else innovation_noise(values)
 
 
 @dataclass(frozen=True)
@@ -220,7 +225,8 @@ class LocalAverage:
     values : ndarray, shape (N,)
         The average of each sample's block, in the signal's unit.
     samples, number : int
-        Number N of samples and M of blocks.
+        Number N of samples and M of blocks; where some do not count, N is the number of differences
+        without any of these.
     repeating : float
         Root mean square of ``values``.
     sigma : float
@@ -257,88 +263,72 @@ class LocalAverage:
         return np.full(points, np.nan)
 
 
-def samples_in_average(signals: Sequence[Array]) -> int:
-    """Number of neighbouring samples whose average still follows some signals.
-
-    An error of a model is about as fast as the motion, and averages over many samples would take it
-    away with the noise: over a whole swing nothing would be left of it.
-
-    Parameters
-    ----------
-    signals : sequence of ndarray, shape (N,)
-        At the same equidistant times.
-    """
-    size = signals[0].size
-    most = max(FEWEST_SAMPLES, size // MOST_AVERAGES)
-    shortest = min(_shortest_period(signal) for signal in signals)
-    return int(np.clip(shortest / IN_A_PERIOD, 1, most))
-
-
-def _shortest_period(signal: Array) -> float:
-    """Period, in samples, at which nearly all of a signal's power beyond its noise is passed."""
-    place = np.arange(signal.size) / signal.size
-    # A record does not end where it began: the jump and the slope would have lines everywhere.
-    level_signal = signal - np.polyval(np.polyfit(place, signal, 1), place)
-    window = 0.5 - 0.5 * np.cos(2 * np.pi * place)
-    power = np.abs(scipy.fft.rfft(level_signal * window)) ** 2
-    level = innovation_noise(signal) ** 2 * float(np.sum(window**2))
-    passed = np.cumsum(power - level)
-    if not passed.max() > 0.0:
-        return float(signal.size)
-    line = int(np.argmax(passed >= SLOWER * passed.max()))
-    return signal.size / max(line, 1)
-
-
-def local_average(values: Array, size: int, sigma: float | None = None) -> LocalAverage:
+def local_average(
+    values: Array, sigma: float | None = None, kept: NDArray[np.bool_] | None = None
+) -> LocalAverage:
     """Average a signal over neighbouring samples.
 
     Parameters
     ----------
     values : ndarray, shape (N,)
         Signal at equidistant times.
-    size : int
-        Samples in an average; see :func:`samples_in_average`.
     sigma : float, optional
         Standard deviation of a sample's noise, where it is known; by default from differences of
         neighbours.
+    kept : ndarray of bool, shape (N,), optional
+        Samples that are averaged.
     """
-    signal = np.asarray(values, dtype=float)
-    number = int(_blocks(signal.size, size)[-1]) + 1
-    means = local_means(signal, size)
+    signal, block = np.asarray(values, dtype=float), _blocks(values.size)
     if sigma is None:
-        sigma = innovation_noise(signal)
+        sigma = innovation_noise(signal, kept)
+    number = int(block[-1]) + 1
+    if kept is None:
+        means, samples = local_means(signal), signal.size
+        noise = sigma * float(np.sqrt(number / signal.size))
+    else:
+        counts = np.bincount(block, kept)
+        sums = np.bincount(block, np.where(kept, signal, 0.0))
+        means = (sums / np.maximum(counts, 1.0))[block]
+        parts = np.where(counts > 0, 1.0 / np.maximum(counts, 1.0), 0.0)
+        noise = sigma * float(np.sqrt(np.mean(parts[block])))
+        samples = _in_a_row(kept)
     return LocalAverage(
         values=means,
-        samples=signal.size,
+        samples=samples,
         number=number,
         repeating=float(np.sqrt(np.mean(means**2))),
         sigma=sigma,
-        noise=sigma * float(np.sqrt(number / signal.size)),
+        noise=noise,
     )
 
 
-def local_means(values: Array, size: int) -> Array:
+def _in_a_row(kept: NDArray[np.bool_]) -> int:
+    """Number of differences of the highest order that hold no sample which does not count."""
+    window = np.convolve(kept.astype(float), np.ones(HIGHEST_DIFFERENCE + 1), mode="valid")
+    return max(1, int(np.sum(window > HIGHEST_DIFFERENCE + 0.5)))
+
+
+def local_means(values: Array) -> Array:
     """Mean over each sample's block of neighbours.
 
     Parameters
     ----------
     values : ndarray, shape (..., N)
-    size : int
-        Samples in a block.
 
     Returns
     -------
     ndarray, shape (..., N)
     """
-    block = _blocks(values.shape[-1], size)
+    block = _blocks(values.shape[-1])
     starts = np.flatnonzero(np.diff(block, prepend=-1))
     sums = np.add.reduceat(values, starts, axis=-1)
     means: Array = (sums / np.bincount(block))[..., block]
     return means
 
 
-def _blocks(samples: int, size: int) -> NDArray[np.int64]:
+def _blocks(samples: int) -> NDArray[np.int64]:
     """Number of the block that each sample lies in, shape (N,)."""
+    size = max(FEWEST_SAMPLES, samples // MOST_AVERAGES)
     number = max(samples // size, 1)
     return np.minimum(np.arange(samples) // size, number - 1)
 

@@ -497,9 +497,10 @@ def hold_out_gap(one: State, other: State, inflation: float = 1.0) -> float:
 
 
 def _inflation(found: Progress) -> float:
-    """Largest variance of an added effect's unknowns over that in white noise."""
+    """Largest variance of an added effect's unknowns over that in white noise, of transients by
+    the colour alone: what early models of a search left is no noise."""
     refits = [item.accepted.refit for item in found.rounds if item.accepted is not None]
-    return max((result.inflation for result in refits if result is not None), default=1.0)
+    return max((result.noise.on_trial for result in refits if result is not None), default=1.0)
 
 
 def _with_classes(best: Progress, other: Progress) -> Progress:

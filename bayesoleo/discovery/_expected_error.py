@@ -30,10 +30,12 @@ from typing import cast
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
+from scipy import stats
 
 from bayesoleo._types import Array
+from bayesoleo.data._noise import local_means
 from bayesoleo.discovery._fit import ModelFit, weights
-from bayesoleo.discovery._fit_and_hold_out_error import RunError, averages_of
+from bayesoleo.discovery._fit_and_hold_out_error import RunError
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._run_predictions import Prediction
 from bayesoleo.prediction._predictor import Predictor
@@ -77,7 +79,7 @@ def curved(prediction: Prediction, root: Array, averaged: Array, policy: SearchP
         return np.ones(outputs)
     changes = (found.y[good] - prediction.y) * weights(record)
     if not record.periodic:
-        changes = averages_of(record, prediction.predictor.outputs, changes)
+        changes = local_means(changes)
     squares = np.mean(changes**2, axis=2)
     squares = np.minimum(squares, policy.farthest_draw**2 * np.mean(squares, axis=0))
     return np.where(linear > 0, np.mean(squares, axis=0) / np.maximum(linear, 1e-300), 1.0)
@@ -127,6 +129,8 @@ class _LinearisedRun:
     weight : ndarray, shape (ny,)
     averaged : ndarray, shape (ny, l, N)
         Sensitivities of the averaged residual.
+    raw : ndarray, shape (ny, l, N)
+        Those of single samples.
     inputs : ndarray, shape (ny, k, N)
         The input's noise in it.
     through : ndarray, shape (ny, l, l)
@@ -139,6 +143,7 @@ class _LinearisedRun:
 
     weight: Array
     averaged: Array
+    raw: Array
     inputs: Array
     through: Array
     information: Array
@@ -158,10 +163,9 @@ class _LinearisedRun:
         information = np.einsum("y,yln,ymn->lm", weight, raw, raw)
         averaged, inputs = raw, columns
         if not record.periodic:
-            outputs = [entry.output for entry in entries]
-            averaged, inputs = (averages_of(record, outputs, one) for one in (raw, columns))
+            averaged, inputs = local_means(raw), local_means(columns)
             through = np.stack([_through(e, J) for e, J in zip(entries, averaged, strict=True)])
-        return cls(weight, averaged, inputs, through, information, scatter, pulled)
+        return cls(weight, averaged, raw, inputs, through, information, scatter, pulled)
 
     def lent(self, output: int, response: Array) -> float:
         """Trace of ``J C J' W N`` in one output, ``C`` the response of the estimates."""
@@ -338,8 +342,18 @@ def expected_of_held_out(
         parameters = J @ J.T / size * bent[b]
         square = entry.noise**2 - 2.0 * run.lent(b, response) / size
         square += run.spread(b, estimated - shared) + float(np.trace(parameters))
-        left.append(_with(entry, run, b, square, parameters, policy))
+        linear = _with(entry, run, b, square, parameters, policy)
+        by_sample = run.raw[b].T @ root
+        moved_by = float(np.mean(np.sum(by_sample**2, axis=1)))
+        left.append(
+            replace(linear, feigned=entry.feigned + most_by_chance(moved_by * bent[b], policy))
+        )
     return left
+
+
+def most_by_chance(square: float, policy: SearchPolicy) -> float:
+    """What chance makes of a mean square by errors of the unknowns at most, were they one."""
+    return square * float(stats.chi2.isf(policy.floor_false_alarm, 1))
 
 
 def _own_response(

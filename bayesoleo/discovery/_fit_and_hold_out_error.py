@@ -36,7 +36,6 @@ from bayesoleo.data._noise import (
     local_means,
     noise_spectrum,
     periodic_average,
-    samples_in_average,
 )
 from bayesoleo.data._sample_quality import emptied_lines, rounding_in_average
 from bayesoleo.discovery._assembly import RecordNoise
@@ -78,6 +77,9 @@ class RunError:
         Part of the squared expected error that is noise.
     own_coefficients : float, optional
         Effective number of coefficients of this part; by default that of the output's own noise.
+    feigned : float, optional
+        Mean square beyond their noise that single samples of a transient may show by chance, by the
+        input's noise and by errors of the unknowns, SI; by default any.
     """
 
     run: str
@@ -93,11 +95,21 @@ class RunError:
     parameters: Array = field(default_factory=lambda: np.zeros((0, 0)))
     own_share: float = 1.0
     own_coefficients: float | None = None
+    feigned: float = np.inf
 
     @property
     def repeating(self) -> float:
-        """Root mean square of the averaged residual."""
-        return self.average.repeating
+        """Root mean square of the averaged residual.
+
+        Averages of a transient take errors away that are fast beside them: over whole swings
+        nothing is left. It is at least what noise would have with what single samples show beyond
+        chance.
+        """
+        averaged = self.average.repeating
+        beyond = self.rms**2 - self.sigma**2 - self.feigned
+        if beyond > averaged**2 - self.noise**2:
+            return float(np.sqrt(self.noise**2 + beyond))
+        return averaged
 
     @property
     def noise(self) -> float:
@@ -278,12 +290,14 @@ def compared(
     for output, rest in zip(predictor.outputs, left, strict=True):
         residual = without_masked(record, rest)
         before.append(measured(output, record.label))
-        averages.append(_average(record, predictor.outputs, output, residual, before[-1], policy))
+        averages.append(_average(record, output, residual, before[-1], policy))
         spectra.append(_spectrum(record, output, residual, averages[-1]))
         # All samples of a transient are used: averages over neighbours contain no fast noise.
         shown.append(averages[-1].values if record.periodic else residual)
-    averaged = columns if record.periodic else averages_of(record, predictor.outputs, columns)
-    spread = np.sqrt(np.mean(np.sum(averaged**2, axis=1), axis=1))
+    averaged = columns if record.periodic else local_means(columns)
+    spread, of_samples = (
+        np.sqrt(np.mean(np.sum(part**2, axis=1), axis=1)) for part in (averaged, columns)
+    )
     scale = borne_out(columns, shown, drawn=not record.periodic, policy=policy)
     factors = [_factor(scale, size, known) for size, known in zip(spread, before, strict=True)]
     entries = [
@@ -297,10 +311,25 @@ def compared(
             spectra[b],
             rounding_in_average(record, output),
             factors[b],
+            feigned=_feigned(record, averages[b], factors[b] * of_samples[b], policy),
         )
         for b, output in enumerate(predictor.outputs)
     ]
     return entries, columns * np.array(factors)[:, None, None]
+
+
+def _feigned(
+    record: Record,
+    average: PeriodicAverage | LocalAverage,
+    by_input: float,
+    policy: SearchPolicy,
+) -> float:
+    """Mean square that noise alone gives the samples of a transient beyond its own, at most."""
+    if not isinstance(average, LocalAverage):
+        return np.inf
+    scatter = average.sigma**2 * np.sqrt(2.0 / counted(record) + 2.0 / average.free)
+    chance = float(stats.norm.isf(policy.floor_false_alarm))
+    return float(chance * scatter + by_input**2)
 
 
 def _factor(scale: float, spread: float, known: RecordNoise | None) -> float:
@@ -321,26 +350,8 @@ def _spectrum(
     return noise_spectrum((residual - average.values) / part, record.periods, emptied)
 
 
-def averages_of(record: Record, outputs: Sequence[str], values: Array) -> Array:
-    """Means of a transient's values over neighbouring samples, shape (..., N).
-
-    Parameters
-    ----------
-    record : Record
-    outputs : sequence of str
-        The fastest of which says how many samples an average has.
-    values : ndarray, shape (..., N)
-    """
-    return local_means(values, _samples_in_average(record, outputs))
-
-
-def _samples_in_average(record: Record, outputs: Sequence[str]) -> int:
-    return samples_in_average([without_masked(record, record.samples[name]) for name in outputs])
-
-
 def _average(
     record: Record,
-    outputs: Sequence[str],
     output: str,
     residual: Array,
     before: RecordNoise | None,
@@ -348,7 +359,7 @@ def _average(
 ) -> PeriodicAverage | LocalAverage:
     if not record.periodic:
         noise = sample_noise(record, output, residual, before, policy=policy)
-        return local_average(residual, _samples_in_average(record, outputs), noise)
+        return local_average(residual, noise, record.kept)
     step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
     return of_those_counted(record, periodic_average(residual, step, record.frequency))
 

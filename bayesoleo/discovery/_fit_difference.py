@@ -12,7 +12,7 @@ Multimodel Inference, section 2.6: models about as likely as the best.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,8 +24,29 @@ from bayesoleo.discovery._score_tests import inflation_of
 from bayesoleo.discovery._transient_variance import noise_along
 
 
-def undecided(base: Base, one: Refit, other: Refit) -> float:
-    """Difference of the sums of squares up to which two estimated effects are about as likely.
+@dataclass(frozen=True)
+class Undecided:
+    """Differences of the sums of squares up to which two models are about as likely.
+
+    Parameters
+    ----------
+    likely : float
+        Twice the logarithm of a ratio of likelihoods, in units of the noise along the difference.
+    scatter : float
+        Standard errors of the difference where both models are wrong; else zero.
+    """
+
+    likely: float
+    scatter: float = 0.0
+
+    @property
+    def most(self) -> float:
+        """The larger of both."""
+        return max(self.likely, self.scatter)
+
+
+def undecided(base: Base, one: Refit, other: Refit) -> Undecided:
+    """Differences up to which two estimated effects are about as likely.
 
     Parameters
     ----------
@@ -35,18 +56,17 @@ def undecided(base: Base, one: Refit, other: Refit) -> float:
 
     Notes
     -----
-    It is twice the logarithm of a ratio of likelihoods, times the noise along the difference of
-    both over white noise. Where the better one leaves more than noise both are wrong, and the
-    difference of their squares scatters by twice the root of what it would be if one were right.
-    What is left of a transient is noise and error alike; that of periodic runs is known apart, and
-    effects that leave an error there are compared by their contributions.
+    Where the better one leaves more than noise both are wrong, and the difference of their squares
+    has the standard deviation ``2 sqrt(noise * length)`` about zero. What is left of a transient is
+    noise and error alike; that of periodic runs is known apart, and effects that leave an error
+    there are compared by their contributions.
     """
     noise, length = noise_between(base, one.fit, other.fit)
     better, policy = max(one, other, key=lambda item: item.fall), one.policy
     likely = policy.equal_likelihood * noise
     if better.reached or base.fit.all_periodic:
-        return likely
-    return max(likely, policy.both_wrong_errors * 2.0 * float(np.sqrt(noise * length)))
+        return Undecided(likely)
+    return Undecided(likely, policy.both_wrong_errors * 2.0 * float(np.sqrt(noise * length)))
 
 
 def noise_between(base: Base, one: ModelFit, other: ModelFit) -> tuple[float, float]:
@@ -71,10 +91,12 @@ def noise_between(base: Base, one: ModelFit, other: ModelFit) -> tuple[float, fl
     length = sum(float(np.sum(part**2)) for part in changes)
     if not (np.isfinite(length) and length > 0.0):
         return 1.0, 0.0
-    if base.fit.all_periodic:
-        return _of_periodic(base, better, changes), length
-    pairs = zip(changes, better, strict=True)
-    along = sum(noise_along(change, left) for change, left in pairs)
+    along, repeats = 0.0, [record.periodic for record in base.fit.records]
+    for change, left, periodic in zip(changes, better, repeats, strict=True):
+        along += 0.0 if periodic or not left.any() else noise_along(change, left)
+    if any(repeats):
+        own = [change * periodic for change, periodic in zip(changes, repeats, strict=True)]
+        along += _of_periodic(base, better, own) * sum(float(np.sum(part**2)) for part in own)
     return max(1.0, along / length), length
 
 

@@ -362,7 +362,7 @@ def confirmed(
     after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
     if not after.hold_errors.entries:
         return after, f"{_explains(item)}, {_on_fitted(result)}; no run was held out"
-    fall = fall_on_hold_out(*judged(state, after), result.inflation)
+    fall = fall_on_hold_out(*judged(state, after), result.noise.on_trial)
     if fall.error == 0.0:
         return None, f"{item.effect} cannot be confirmed: it changes no hold-out run that is solved"
     where = f"hold-out runs: the weighted squared error falls by {fall}"

@@ -156,7 +156,7 @@ def _evidence(
         fall = None
         if state.hold_errors.entries and np.isfinite(loss.rise):
             before = state_of(state.assembly.without(step), fit, roles)
-            fall = fall_on_hold_out(*judged(before, state), loss.noise.value)
+            fall = fall_on_hold_out(*judged(before, state), loss.noise.on_trial)
         declared = roles.strategy == "declared"
         found.append(Evidence(loss, fall, tests, declared, state.policy))
     return [one for one in found if one.is_known]

@@ -21,7 +21,7 @@ from bayesoleo._types import Array, ProgressCallback
 from bayesoleo.data._harmonics import FALSE_ALARM
 from bayesoleo.discovery._assembly import Assembly, Option
 from bayesoleo.discovery._fit import ModelFit, weights
-from bayesoleo.discovery._fit_difference import undecided
+from bayesoleo.discovery._fit_difference import Undecided, undecided
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._refit import Refit
 from bayesoleo.discovery._scanned_columns import MOST_KEPT, Scanned, size_of
@@ -344,9 +344,9 @@ def rank(
     policy : SearchPolicy
     """
     groups = classes(scores, policy=policy)
-    known: dict[frozenset[int], float] = {}
+    known: dict[frozenset[int], Undecided] = {}
 
-    def about_as_likely(one: Refit, other: Refit) -> float | None:
+    def about_as_likely(one: Refit, other: Refit) -> Undecided | None:
         if base is None or not (np.isfinite(one.share) and np.isfinite(other.share)):
             return None
         pair = frozenset((id(one), id(other)))
@@ -384,7 +384,7 @@ def _same(
     k: int,
     group: Sequence[int],
     refits: dict[int, Refit],
-    undecided: Callable[[Refit, Refit], float | None],
+    about_as_likely: Callable[[Refit, Refit], Undecided | None],
 ) -> tuple[str, ...]:
     """Effects that are indistinguishable from number ``k``, by their estimates if both have one."""
     own, found = refits.get(id(scores[k])), []
@@ -393,7 +393,9 @@ def _same(
         if j == k:
             continue
         if own is not None and estimated is not None and np.isfinite(estimated.share):
-            alike = own.resembles(estimated, undecided(own, estimated))
+            within = about_as_likely(own, estimated)
+            limits = () if within is None else (within.likely, within.scatter)
+            alike = own.resembles(estimated, *limits)
         elif own is not None and estimated is not None and own.reached:
             # After a failed estimate only the score can distinguish the two.
             alike = not own.outdoes(other)

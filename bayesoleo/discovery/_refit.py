@@ -115,15 +115,15 @@ class Refit:
         """Variance of the fall of the sum of squares over what white noise gives."""
         return self.noise.value
 
-    def resembles(self, other: Refit, undecided: float | None = None) -> bool:
+    def resembles(self, other: Refit, likely: float | None = None, scatter: float = 0.0) -> bool:
         """Whether the data cannot distinguish two estimated effects.
 
         Parameters
         ----------
         other : Refit
-        undecided : float, optional
-            Difference of the sums of squares up to which they are about as likely, by the noise
-            along their difference (``_fit_difference.undecided``); by default by the larger of
+        likely, scatter : float, optional
+            Differences of the sums of squares up to which they are about as likely, by the noise
+            along their difference (``_fit_difference.Undecided``); by default by the larger of
             their inflations.
 
         Notes
@@ -140,9 +140,9 @@ class Refit:
             return False
         gap = self.worth - other.worth
         policy = self.policy
-        if undecided is None:
-            undecided = policy.equal_likelihood * max(self.inflation, other.inflation)
-        if -policy.not_taken_odds * undecided < gap < undecided:
+        if likely is None:
+            likely = policy.equal_likelihood * max(self.inflation, other.inflation)
+        if -max(policy.not_taken_odds * likely, scatter) < gap < max(likely, scatter):
             return True
         lengths = np.linalg.norm(self.contribution) * np.linalg.norm(other.contribution)
         if (self.reached and other.reached) or lengths == 0:

@@ -83,7 +83,7 @@ class Place:
             result = rival.refit
             assert result is not None
             gap = result.worth - own.worth
-            needed = undecided(self.base, result, own) * _dispersion(result, self.base)
+            needed = undecided(self.base, result, own).most * _dispersion(result, self.base)
             if rival.absorbs < self.own.absorbs:
                 needed = -needed
             clearly = result.reached or gap > policy.fair_share * own.remaining
@@ -192,7 +192,7 @@ def _close_rivals(progress: Progress, step: AddedEffect) -> list[tuple[Refit, fl
         and np.isfinite(item.refit.share)
         and item.score.option.candidate.family != FAMILY
     ]
-    near = [one for one in rivals if one[1] < 2.0 * own.price * own.inflation]
+    near = [one for one in rivals if one[1] < 2.0 * own.price * own.noise.on_trial]
     return sorted(near, key=lambda one: one[1])[: own.policy.review_simpler]
 
 
@@ -218,7 +218,7 @@ def _without_companion(
     contradict it."""
     final, name = progress.state, result.score.option.key[0]
     after = fit_state(result.assembly.without(least.step), roles, numerics)
-    if (final.at_floor and not after.at_floor) or contradicted(final, after, result.inflation):
+    if (final.at_floor and not after.at_floor) or contradicted(final, after, result.noise.on_trial):
         return None
     entry = _entry_of(progress, step)
     assert entry is not None
@@ -372,7 +372,7 @@ def _replaced(
     after, reason = confirmed(before, better, better.refit, roles, numerics, callback)
     if after is None or (final.at_floor and not after.at_floor):
         return None
-    if contradicted(final, after, better.refit.inflation):
+    if contradicted(final, after, better.refit.noise.on_trial):
         return None
     gained = better.refit.worth - place.own.refit.worth
     way = f"lower by {gained:.3g}" if gained > 0 else f"higher by {-gained:.3g} only"

@@ -313,7 +313,9 @@ def _choose(
 def _as_good(base: Base, result: Refit, other: Refit) -> bool:
     """Whether an effect leaves only noise and its worth is close to that of another one."""
     less = other.worth - result.worth
-    return result.reached and less < result.policy.compared_worth * undecided(base, result, other)
+    return (
+        result.reached and less < result.policy.compared_worth * undecided(base, result, other).most
+    )
 
 
 @dataclass(frozen=True)

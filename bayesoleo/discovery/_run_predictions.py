@@ -129,11 +129,12 @@ def sample_noise(
         Where it was measured before.
     policy : SearchPolicy
     """
-    shown = innovation_noise(residual)
+    shown = innovation_noise(residual, record.kept)
     if before is not None:
         known = before.sigma
         return shown if shown < policy.clearly_less_noise * known else known
-    return min(shown, innovation_noise(without_masked(record, record.samples[output])))
+    samples = without_masked(record, record.samples[output])
+    return min(shown, innovation_noise(samples, record.kept))
 
 
 @dataclass(frozen=True)

@@ -416,9 +416,7 @@ class Base:
     noise : float
         Expected sum of squares of the averaged residual, had only noise remained.
     excess : float
-        Sum of squares of the averaged residual beyond that. Of transients, whose averages take
-        short errors away too, it is at least what all samples have beyond their noise, less what
-        noise alone could feign.
+        Sum of squares of the averaged residual beyond that.
     doubt : float
         Standard deviation of the excess where nothing is missing: the residual's own scatter, and
         that of the noise, which is measured too.
@@ -463,7 +461,7 @@ def base_of(fit: ModelFit, errors: Mapping[tuple[str, str], RunError]) -> Base:
         What is left in the fitted runs, and the noise.
     """
     gram, gradient = _prior_terms(fit)
-    runs, noise, excess, variance, transients = [], 0.0, 0.0, 0.0, _Excess()
+    runs, noise, excess, variance = [], 0.0, 0.0, 0.0
     for r, record in enumerate(fit.records):
         entries = [errors[record.label, output] for output in fit.predictor.outputs]
         measured = fit.predictor.runs[r].measured
@@ -472,48 +470,16 @@ def base_of(fit: ModelFit, errors: Mapping[tuple[str, str], RunError]) -> Base:
         run = _run_base(fit, r, sigma, borne_out, _spectra(entries))
         cross, _, score = run.products(run.sensitivity)
         gram, gradient = gram + cross, gradient + score
-        averaged = 0.0
         for entry, value in zip(entries, sigma, strict=True):
             own = counted(record) * (entry.noise / value) ** 2
             noise += own
             variance += 2.0 * own**2 * (1.0 / entry.coefficients + 1.0 / max(entry.free, 1.0))
-            averaged += counted(record) * (entry.repeating**2 - entry.noise**2) / value**2
-        if record.periodic:
-            excess += averaged
-        else:
-            transients = transients.plus(averaged, run, entries, counted(record))
+            excess += counted(record) * (entry.repeating**2 - entry.noise**2) / value**2
         runs.append(run)
-    excess += transients.least(fit.policy.excess_errors)
     doubt = float(np.sqrt(variance))
     data = SpectralData.of(fit)
     units = _units_of(fit)
     return Base(fit, runs, gram, gradient, noise, excess, doubt, fit.policy, data, units)
-
-
-@dataclass(frozen=True)
-class _Excess:
-    """Excess of transients by averages and by all samples, and the variance of the latter where
-    nothing is missing."""
-
-    averaged: float = 0.0
-    samples: float = 0.0
-    variance: float = 0.0
-
-    def plus(
-        self, averaged: float, run: RunBase, entries: Sequence[RunError], count: int
-    ) -> _Excess:
-        """With one more run, of so many samples."""
-        noise = count * len(entries) + float(np.sum(run.input_noise**2))
-        free = sum(1.0 / count + 1.0 / max(entry.free, 1.0) for entry in entries)
-        return _Excess(
-            self.averaged + averaged,
-            self.samples + float(run.residual @ run.residual) - noise,
-            self.variance + 2.0 * count**2 * free,
-        )
-
-    def least(self, errors: float) -> float:
-        """What there is at least, with so many standard errors left to the noise."""
-        return max(self.averaged, self.samples - errors * float(np.sqrt(self.variance)))
 
 
 def _prior_terms(fit: ModelFit) -> tuple[Array, Array]:

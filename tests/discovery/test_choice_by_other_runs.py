@@ -8,6 +8,7 @@ import pytest
 from fitted_states import NUMERICS
 
 from bayesoleo.discovery import _round as rounds
+from bayesoleo.discovery._fit_difference import Undecided
 
 
 def estimated(worth, reached=True):
@@ -50,7 +51,7 @@ def test_the_one_that_predicts_the_runs_held_out(monkeypatch, worths, at_floor, 
         return after, item.effect
 
     monkeypatch.setattr(rounds, "confirmed", confirmed)
-    monkeypatch.setattr(rounds, "undecided", lambda *_: NUMERICS.policy.equal_likelihood)
+    monkeypatch.setattr(rounds, "undecided", lambda *_: Undecided(NUMERICS.policy.equal_likelihood))
     item, after, _ = rounds._choose(None, None, ranking, refits, None, NUMERICS, print)
     assert item.effect == taken
     assert after is not None

@@ -13,6 +13,7 @@ from small_campaigns import damper, damper_campaign
 from bayesoleo.discovery import _refit as refits, _review as review
 from bayesoleo.discovery._alternatives import followed, leads_as_far
 from bayesoleo.discovery._assembly import Assembly, assign
+from bayesoleo.discovery._fit_difference import Undecided
 from bayesoleo.discovery._loop import SearchOptions, close_loop, searched
 from bayesoleo.discovery._nonparametric_round import (
     _several_in_one_balance,
@@ -171,7 +172,7 @@ def test_what_replaces_an_effect_explains_a_good_part_of_what_that_leaves(
     monkeypatch, gap, remaining, reached, replaced
 ):
     monkeypatch.setattr(review, "_dispersion", lambda *_: 1.0)
-    monkeypatch.setattr(review, "undecided", lambda *_: POLICY.equal_likelihood)
+    monkeypatch.setattr(review, "undecided", lambda *_: Undecided(POLICY.equal_likelihood))
 
     def item(name, worth, left, at_noise):
         estimate = SimpleNamespace(
@@ -266,7 +267,7 @@ def test_names_come_together_in_one_balance(steps, several):
 @pytest.mark.parametrize(("gap", "replaced"), [(-4.0, True), (-8.0, False), (8.0, True)])
 def test_a_cause_that_is_as_likely_stands_instead_of_what_varies_by_run(monkeypatch, gap, replaced):
     monkeypatch.setattr(review, "_dispersion", lambda *_: 1.0)
-    monkeypatch.setattr(review, "undecided", lambda *_: POLICY.equal_likelihood)
+    monkeypatch.setattr(review, "undecided", lambda *_: Undecided(POLICY.equal_likelihood))
 
     def item(name, family, worth):
         found = accepted(name, ())

@@ -139,7 +139,8 @@ def test_runs_without_a_solution_are_not_said_to_speak_against_an_effect(monkeyp
     item = SimpleNamespace(effect="play", gain=0.5)
     point = SimpleNamespace(theta=np.zeros(1))
     result = SimpleNamespace(
-        share=0.5, reached=True, excludes_null=lambda: True, inflation=1.0, assembly=None,
+        share=0.5, reached=True, excludes_null=lambda: True, noise=SimpleNamespace(on_trial=1.0), assembly=None,
+        inflation=1.0,
         fit=SimpleNamespace(point=point),
     )  # fmt: skip
     after = SimpleNamespace(hold_errors=SimpleNamespace(entries=[1]))
@@ -287,7 +288,8 @@ def test_halves_of_a_run_do_not_say_that_it_differs_from_others(
 ):
     """They share what is odd in it: a parameter of its own always repeats there."""
     refit = SimpleNamespace(
-        share=0.5, reached=reached, inflation=1.0, fall=50.0, size=1, assembly=None,
+        share=0.5, reached=reached, inflation=1.0, noise=SimpleNamespace(on_trial=1.0), fall=50.0,
+        size=1, assembly=None,
         fit=SimpleNamespace(point=SimpleNamespace(theta=None)), excludes_null=lambda: True,
     )  # fmt: skip
     after = SimpleNamespace(hold_errors=SimpleNamespace(entries=[1]))

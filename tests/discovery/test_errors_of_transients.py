@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +12,7 @@ from small_campaigns import _coloured, damper, damper_campaign
 
 from bayesoleo.discovery import _fit_difference as difference, _ranking as ranking
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._fit_difference import noise_between, undecided
+from bayesoleo.discovery._fit_difference import Undecided, noise_between, undecided
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import rank
 from bayesoleo.discovery._refit import Refit, refit_all
@@ -47,7 +48,8 @@ def test_errors_of_hundreds_of_swings_are_seen(tmp_path, force):
     state = fitted(tmp_path, force)
     for entry in state.fit_errors.entries:
         beyond = entry.repeating**2 - entry.noise**2
-        assert beyond > 0.7 * (entry.rms**2 - 1.0)  # the noise is of 1 N
+        # The noise is of 1 N; differences see a part of the peaks, and chance is left out.
+        assert beyond > 0.6 * (entry.rms**2 - 1.0)
     assert not state.at_floor
 
 
@@ -61,43 +63,83 @@ def test_shares_are_of_all_that_samples_have_beyond_their_noise(tmp_path, force)
         for record, entry in zip(state.fit.records, state.fit_errors.entries, strict=True)
     )
     for result in refit_all(base, found, NUMERICS):
-        # What noise could feign is in the denominator.
-        assert result.share == pytest.approx(result.fall / beyond, rel=0.1)
-        assert result.share < 1.05
+        # Three standard errors are left to the noise, and the denominator holds what it feigns.
+        assert result.share == pytest.approx(result.fall / beyond, rel=0.15)
+        assert result.share < 1.15
+
+
+def peaks(x, v, _):
+    return 1000.0 * x + 200.0 * v + 5.0 * np.exp(-((v / 0.001) ** 2)) * np.sign(x)
 
 
 def test_shares_of_short_errors_in_slow_motions_are_of_single_samples(tmp_path):
     """Averages over thirty samples lose most of a peak of ten, which holds little of the force."""
-
-    def peaks(x, v, _):
-        return 1000.0 * x + 200.0 * v + 5.0 * np.exp(-((v / 0.001) ** 2)) * np.sign(x)
-
     state = fitted(tmp_path, peaks, **(FEW | {"noise": 0.2}))
-    base = state.base()
-    entries = state.fit_errors.entries
-    averaged = sum((e.repeating**2 - e.noise**2) / e.rms**2 for e in entries) / len(entries)
-    assert averaged < 0.6 * sum(1.0 - 0.04 / e.rms**2 for e in entries) / len(entries)
+    base, entries = state.base(), state.fit_errors.entries
+    averaged = sum((e.average.repeating**2 - e.noise**2) / e.rms**2 for e in entries)
+    assert averaged < 0.6 * sum(1.0 - 0.04 / e.rms**2 for e in entries)
     sizes = [len(record.time) for record in state.fit.records]
     beyond = sum(n * (e.rms**2 / e.sigma**2 - 1.0) for n, e in zip(sizes, entries, strict=True))
-    # Less two standard errors of it.
-    assert 0.9 * beyond < base.excess < beyond
+    # Less three standard errors of it.
+    assert 0.85 * beyond < base.excess < beyond
+
+
+def plain(x, v, _):
+    return 1000.0 * x + 200.0 * v
 
 
 @pytest.mark.parametrize("swings", [MANY, FEW])
-def test_noise_has_no_excess(tmp_path, swings):
-    """In one of forty campaigns it seems to, and a share is then of what noise could feign."""
-    excesses = []
-    for seed in range(12):
-        folder = tmp_path / str(seed)
-        state = fitted(folder, lambda x, v, _: 1000.0 * x + 200.0 * v, seed, **swings)
+@pytest.mark.parametrize("masked", [0.0, 0.1, 0.3])
+def test_noise_has_no_excess(tmp_path, swings, masked):
+    """In one of forty campaigns it seems to, and a share is then of what noise could feign. What
+    bridges masked samples is smooth, and no part of the noise."""
+    excesses, ratios = [], []
+    for seed in range(8):
+        reduced = damper_campaign(tmp_path / str(seed), plain, seed=seed, **swings)
+        rng = np.random.default_rng(seed)
+        records = tuple(
+            replace(record, kept=rng.random(record.time.size) > masked) if masked else record
+            for record in reduced.records
+        )
+        state = fit_state(Assembly(damper(cubic=False)), assign(records), NUMERICS)
         base = state.base()
         excesses.append(base.excess / base.feigned)
+        ratios += [entry.ratio for entry in state.errors.entries]
+        assert state.at_floor
     assert max(excesses) < 1.5
-    assert np.median(excesses) < 0.3
+    assert np.median(excesses) < 0.5
+    # Forty ratios of two hundred averages; masked ones know their noise from fewer differences.
+    assert np.mean(np.square(ratios)) == pytest.approx(1.0, abs=0.1)
+
+
+def test_slow_errors_beside_fast_motions_are_seen(tmp_path):
+    def drifting(x, v, time):
+        return plain(x, v, time) + 0.6 * np.sin(2 * np.pi * 1.3 * time / time[-1])
+
+    state = fitted(tmp_path, drifting, **MANY)
+    assert not state.at_floor
+    assert all(entry.ratio > 1.5 for entry in state.fit_errors.entries)
+
+
+def test_a_short_burst_at_the_start_is_seen(tmp_path):
+    def begun(x, v, time):
+        return plain(x, v, time) + 6.0 * np.sin(time * 900.0) * (time < 0.02 * time[-1])
+
+    state = fitted(tmp_path, begun, **(FEW | {"noise": 0.3}))
+    assert not state.at_floor
+
+
+def test_errors_of_poorly_known_unknowns_are_no_missing_effect(tmp_path):
+    """They are as fast as the motion: single samples of hold-out runs show them."""
+    runs = (("a", 1.0, 0.0002, "fit"), ("d", 1.5, 0.010, "hold-out"), ("e", 1.0, 0.012, "hold-out"))
+    for seed in range(8):
+        state = fitted(tmp_path / str(seed), plain, seed, runs=runs, **MANY)
+        assert state.at_floor
+        assert not state.too_quiet
 
 
 def saturating(x, v, _):
-    return 1000.0 * x + 200.0 * v + 20.0 * np.tanh(v / 0.01)
+    return plain(x, v, _) + 20.0 * np.tanh(v / 0.01)
 
 
 def test_estimated_effects_are_alike_by_the_noise_along_their_difference(tmp_path, monkeypatch):
@@ -111,10 +153,10 @@ def test_estimated_effects_are_alike_by_the_noise_along_their_difference(tmp_pat
     assert by_name["coulomb_friction"].same == ()
     assert by_name["dahl_friction"].refit.inflation > 10.0, "what it leaves is coloured and large"
     right, wrong = (by_name[name].refit for name in ("coulomb_friction", "dahl_friction"))
-    assert undecided(base, right, wrong) < 2.0 * POLICY.equal_likelihood
+    assert undecided(base, right, wrong).most < 2.0 * POLICY.equal_likelihood
     # However much they differ, both ways round, and each pair is looked at once.
     seen = []
-    monkeypatch.setattr(ranking, "undecided", lambda *pair: seen.append(pair) or np.inf)
+    monkeypatch.setattr(ranking, "undecided", lambda *pair: seen.append(pair) or Undecided(np.inf))
     monkeypatch.setattr(Refit, "_leaves_clearly_less", lambda *_: False)
     known = rank(scores, 10.0, refits, base=base)
     assert {len(item.same) for item in known} == {2}
@@ -125,7 +167,8 @@ def models(residuals, *, reached=False):
     """Two estimated effects and what both were estimated against, by what they leave of one run."""
     measured = np.zeros((1, residuals[0].size))
     run = SimpleNamespace(scale=np.ones(residuals[0].size))
-    base = SimpleNamespace(runs=[run], fit=SimpleNamespace(all_periodic=False))
+    record = SimpleNamespace(periodic=False)
+    base = SimpleNamespace(runs=[run], fit=SimpleNamespace(all_periodic=False, records=[record]))
     made = []
     for left in residuals:
         fit = SimpleNamespace(
@@ -148,7 +191,7 @@ def test_two_wrong_models_are_told_apart_by_chance_in_one_case_of_twenty(colour,
     for _ in range(300):
         noise = _coloured(rng, place.size, colour)
         base, one, other = models((noise + parts * change, noise + (parts - 1.0) * change))
-        told.append(abs(one.fall - other.fall) > undecided(base, one, other))
+        told.append(abs(one.fall - other.fall) > undecided(base, one, other).most)
     # Near zero the odds of twenty rule; of three hundred cases a twentieth is known to 1.3 %.
     if parts == 1.0:
         assert np.mean(told) > 0.95
@@ -162,13 +205,13 @@ def test_one_that_is_right_is_told_apart_by_the_odds():
     change = np.cos(np.arange(4000) / 20.0) * 0.2
     for size in (1.0, 100.0):
         base, right, wrong = models((noise, noise + size * change), reached=True)
-        by_odds = undecided(base, right, wrong)
+        by_odds = undecided(base, right, wrong).most
         # The noise along one smooth direction is known from a few lines. What the wrong one
         # leaves is no part of it.
         assert by_odds == pytest.approx(POLICY.equal_likelihood, rel=0.8)
         assert right.fall - wrong.fall > by_odds
     right.reached = False
-    assert undecided(base, right, wrong) > 2.0 * by_odds
+    assert undecided(base, right, wrong).most > 2.0 * by_odds
     assert undecided(base, wrong, right) == undecided(base, right, wrong)
 
 
@@ -178,4 +221,4 @@ def test_fits_that_do_not_differ_or_have_no_solution_have_no_noise_between_them(
     assert noise_between(base, one.fit, other.fit) == (1.0, 0.0)
     base, one, other = models((left, np.full(50, np.nan)))
     assert noise_between(base, one.fit, other.fit) == (1.0, 0.0)
-    assert difference.undecided(base, one, other) == POLICY.equal_likelihood
+    assert difference.undecided(base, one, other).most == POLICY.equal_likelihood

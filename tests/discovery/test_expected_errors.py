@@ -150,7 +150,7 @@ def test_differences_know_the_noise_as_well_as_they_say():
     """Over white noise: the scatter of the estimated variance is that of so many independent
     samples or a little less, whichever order of differences was chosen."""
     rng = np.random.default_rng(4)
-    found = [local_average(rng.standard_normal(500), 4) for _ in range(600)]
+    found = [local_average(rng.standard_normal(500)) for _ in range(600)]
     variances = np.array([item.sigma**2 for item in found])
     shown = 2.0 * np.mean(variances) ** 2 / np.var(variances)
     assert found[0].free < 1.1 * shown
