@@ -34,6 +34,7 @@ from ._ranking import (
     scales_of as scales_of,
 )
 from ._refit import (
+    Inflation as Inflation,
     Refit as Refit,
 )
 from ._round import (

@@ -139,9 +139,8 @@ def test_runs_without_a_solution_are_not_said_to_speak_against_an_effect(monkeyp
     item = SimpleNamespace(effect="play", gain=0.5)
     point = SimpleNamespace(theta=np.zeros(1))
     result = SimpleNamespace(
-        share=0.5, reached=True, excludes_null=lambda: True, noise=SimpleNamespace(on_trial=1.0), assembly=None,
-        inflation=1.0,
-        fit=SimpleNamespace(point=point),
+        share=0.5, reached=True, excludes_null=lambda: True, inflation=1.0, assembly=None,
+        noise=SimpleNamespace(on_trial=1.0), fit=SimpleNamespace(point=point),
     )  # fmt: skip
     after = SimpleNamespace(hold_errors=SimpleNamespace(entries=[1]))
     monkeypatch.setattr(confirmation, "fit_state", lambda *_, **__: after)
