@@ -94,7 +94,7 @@ def test_noise_has_no_excess(tmp_path, swings, masked):
     """In one of forty campaigns it seems to, and a share is then of what noise could feign. What
     bridges masked samples is smooth, and no part of the noise."""
     excesses, ratios = [], []
-    for seed in range(8):
+    for seed in range(4):
         reduced = damper_campaign(tmp_path / str(seed), plain, seed=seed, **swings)
         rng = np.random.default_rng(seed)
         records = tuple(
@@ -108,7 +108,7 @@ def test_noise_has_no_excess(tmp_path, swings, masked):
         assert state.at_floor
     assert max(excesses) < 1.5
     assert np.median(excesses) < 0.5
-    # Forty ratios of two hundred averages; masked ones know their noise from fewer differences.
+    # Twenty ratios of two hundred averages; masked ones know their noise from fewer differences.
     assert np.mean(np.square(ratios)) == pytest.approx(1.0, abs=0.1)
 
 
@@ -132,7 +132,7 @@ def test_a_short_burst_at_the_start_is_seen(tmp_path):
 def test_errors_of_poorly_known_unknowns_are_no_missing_effect(tmp_path):
     """They are as fast as the motion: single samples of hold-out runs show them."""
     runs = (("a", 1.0, 0.0002, "fit"), ("d", 1.5, 0.010, "hold-out"), ("e", 1.0, 0.012, "hold-out"))
-    for seed in range(8):
+    for seed in range(4):
         state = fitted(tmp_path / str(seed), plain, seed, runs=runs, **MANY)
         assert state.at_floor
         assert not state.too_quiet
