@@ -305,7 +305,7 @@ def _errors(
     one = Prediction(record, at_estimate.y[0], values, 0, status, predictor)
     entries, _ = compared(one, {record.label: record.role})
     raw = (draws - at_estimate.y[0]) * weights(record)
-    averaged = raw if record.periodic else local_means(raw)
+    averaged = raw if record.periodic else local_means(raw, record.kept)
     moved, of_samples = (np.mean(changes**2, axis=(0, 2)) for changes in (averaged, raw))
     found = []
     for one_output, square, single in zip(entries, moved, of_samples, strict=True):

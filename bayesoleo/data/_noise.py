@@ -225,14 +225,15 @@ class LocalAverage:
     values : ndarray, shape (N,)
         The average of each sample's block, in the signal's unit.
     samples, number : int
-        Number N of samples and M of blocks; where some do not count, N is the number of differences
-        without any of these.
+        Number N of samples that count and M of blocks.
     repeating : float
         Root mean square of ``values``.
     sigma : float
         Standard deviation of a single sample's noise, from differences of neighbours.
     noise : float
-        Standard error of a block's average, root mean square over the blocks.
+        Standard error of a block's average, root mean square over the samples.
+    differences : int
+        Number of differences of neighbours that count, by which ``sigma`` is known.
     """
 
     values: Array
@@ -241,6 +242,7 @@ class LocalAverage:
     repeating: float
     sigma: float
     noise: float
+    differences: int
 
     @property
     def ratio(self) -> float:
@@ -256,7 +258,7 @@ class LocalAverage:
         """
         order = HIGHEST_DIFFERENCE
         shared = comb(4 * order, 2 * order) / comb(2 * order, order) ** 2
-        return max(self.samples / shared, 1.0)
+        return max(self.differences / shared, 1.0)
 
     def on_phase(self, points: int) -> Array:
         """A transient has no phase: not a number, shape (points,)."""
@@ -278,27 +280,21 @@ def local_average(
     kept : ndarray of bool, shape (N,), optional
         Samples that are averaged.
     """
-    signal, block = np.asarray(values, dtype=float), _blocks(values.size)
+    signal = np.asarray(values, dtype=float)
     if sigma is None:
         sigma = innovation_noise(signal, kept)
+    block, means = _blocks(signal.size), local_means(signal, kept)
+    counts = np.bincount(block, kept)
+    part = np.where(counts > 0, 1.0 / np.maximum(counts, 1.0), 0.0)
     number = int(block[-1]) + 1
-    if kept is None:
-        means, samples = local_means(signal), signal.size
-        noise = sigma * float(np.sqrt(number / signal.size))
-    else:
-        counts = np.bincount(block, kept)
-        sums = np.bincount(block, np.where(kept, signal, 0.0))
-        means = (sums / np.maximum(counts, 1.0))[block]
-        parts = np.where(counts > 0, 1.0 / np.maximum(counts, 1.0), 0.0)
-        noise = sigma * float(np.sqrt(np.mean(parts[block])))
-        samples = _in_a_row(kept)
     return LocalAverage(
         values=means,
-        samples=samples,
+        samples=signal.size if kept is None else int(kept.sum()),
         number=number,
         repeating=float(np.sqrt(np.mean(means**2))),
         sigma=sigma,
-        noise=noise,
+        noise=sigma * float(np.sqrt(np.mean(part[block]))),
+        differences=signal.size if kept is None else _in_a_row(kept),
     )
 
 
@@ -308,12 +304,14 @@ def _in_a_row(kept: NDArray[np.bool_]) -> int:
     return max(1, int(np.sum(window > HIGHEST_DIFFERENCE + 0.5)))
 
 
-def local_means(values: Array) -> Array:
+def local_means(values: Array, kept: NDArray[np.bool_] | None = None) -> Array:
     """Mean over each sample's block of neighbours.
 
     Parameters
     ----------
     values : ndarray, shape (..., N)
+    kept : ndarray of bool, shape (N,), optional
+        Samples that are averaged; a block without any has the mean zero.
 
     Returns
     -------
@@ -321,8 +319,9 @@ def local_means(values: Array) -> Array:
     """
     block = _blocks(values.shape[-1])
     starts = np.flatnonzero(np.diff(block, prepend=-1))
-    sums = np.add.reduceat(values, starts, axis=-1)
-    means: Array = (sums / np.bincount(block))[..., block]
+    counted = values if kept is None else np.where(kept, values, 0.0)
+    sums = np.add.reduceat(counted, starts, axis=-1)
+    means: Array = (sums / np.maximum(np.bincount(block, kept), 1.0))[..., block]
     return means
 
 

@@ -79,7 +79,7 @@ def curved(prediction: Prediction, root: Array, averaged: Array, policy: SearchP
         return np.ones(outputs)
     changes = (found.y[good] - prediction.y) * weights(record)
     if not record.periodic:
-        changes = local_means(changes)
+        changes = local_means(changes, record.kept)
     squares = np.mean(changes**2, axis=2)
     squares = np.minimum(squares, policy.farthest_draw**2 * np.mean(squares, axis=0))
     return np.where(linear > 0, np.mean(squares, axis=0) / np.maximum(linear, 1e-300), 1.0)
@@ -163,7 +163,7 @@ class _LinearisedRun:
         information = np.einsum("y,yln,ymn->lm", weight, raw, raw)
         averaged, inputs = raw, columns
         if not record.periodic:
-            averaged, inputs = local_means(raw), local_means(columns)
+            averaged, inputs = (local_means(one, record.kept) for one in (raw, columns))
             through = np.stack([_through(e, J) for e, J in zip(entries, averaged, strict=True)])
         return cls(weight, averaged, raw, inputs, through, information, scatter, pulled)
 
@@ -343,11 +343,9 @@ def expected_of_held_out(
         square = entry.noise**2 - 2.0 * run.lent(b, response) / size
         square += run.spread(b, estimated - shared) + float(np.trace(parameters))
         linear = _with(entry, run, b, square, parameters, policy)
-        by_sample = run.raw[b].T @ root
-        moved_by = float(np.mean(np.sum(by_sample**2, axis=1)))
-        left.append(
-            replace(linear, feigned=entry.feigned + most_by_chance(moved_by * bent[b], policy))
-        )
+        moved_by = float(np.mean(np.sum((root.T @ run.raw[b]) ** 2, axis=0)))
+        by_chance = most_by_chance(moved_by * bent[b], policy)
+        left.append(replace(linear, feigned=entry.feigned + by_chance))
     return left
 
 

@@ -294,7 +294,7 @@ def compared(
         spectra.append(_spectrum(record, output, residual, averages[-1]))
         # All samples of a transient are used: averages over neighbours contain no fast noise.
         shown.append(averages[-1].values if record.periodic else residual)
-    averaged = columns if record.periodic else local_means(columns)
+    averaged = columns if record.periodic else local_means(columns, record.kept)
     spread, of_samples = (
         np.sqrt(np.mean(np.sum(part**2, axis=1), axis=1)) for part in (averaged, columns)
     )

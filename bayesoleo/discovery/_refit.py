@@ -128,7 +128,6 @@ class Refit:
 
         Notes
         -----
-
         The noise decides how significant a difference is. Small effects may be different and still
         equally likely (Burnham and Anderson 2002, section 2.6); large effects may be similar and
         still differ clearly. Where one of them leaves more than noise, the likelihood overstates

@@ -8,8 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from fitted_states import NUMERICS, options
-from small_campaigns import _coloured, damper, damper_campaign
+from small_campaigns import DAMPER_RUNS, _coloured, damper, damper_campaign
 
+from bayesoleo.data._noise import local_average, local_means
 from bayesoleo.discovery import _fit_difference as difference, _ranking as ranking
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._fit_difference import Undecided, noise_between, undecided
@@ -37,9 +38,15 @@ def spiky(x, v, _):
     return 1000.0 * x + 200.0 * v + 8.0 * np.exp(-((v / 0.02) ** 2)) * np.sign(x)
 
 
-def fitted(folder, force, seed=0, **more):
+def fitted(folder, force, seed=0, masked=0.0, **more):
+    """The damper's linear law, a part of the samples masked at random."""
     reduced = damper_campaign(folder, force, seed=seed, **(MANY | more))
-    return fit_state(Assembly(damper(cubic=False)), assign(reduced.records), NUMERICS)
+    rng = np.random.default_rng(seed)
+    records = tuple(
+        replace(record, kept=rng.random(record.time.size) > masked) if masked else record
+        for record in reduced.records
+    )
+    return fit_state(Assembly(damper(cubic=False)), assign(records), NUMERICS)
 
 
 @pytest.mark.parametrize("force", [smooth, spiky])
@@ -95,13 +102,7 @@ def test_noise_has_no_excess(tmp_path, swings, masked):
     bridges masked samples is smooth, and no part of the noise."""
     excesses, ratios = [], []
     for seed in range(4):
-        reduced = damper_campaign(tmp_path / str(seed), plain, seed=seed, **swings)
-        rng = np.random.default_rng(seed)
-        records = tuple(
-            replace(record, kept=rng.random(record.time.size) > masked) if masked else record
-            for record in reduced.records
-        )
-        state = fit_state(Assembly(damper(cubic=False)), assign(records), NUMERICS)
+        state = fitted(tmp_path / str(seed), plain, seed, masked, **swings)
         base = state.base()
         excesses.append(base.excess / base.feigned)
         ratios += [entry.ratio for entry in state.errors.entries]
@@ -129,13 +130,24 @@ def test_a_short_burst_at_the_start_is_seen(tmp_path):
     assert not state.at_floor
 
 
-def test_errors_of_poorly_known_unknowns_are_no_missing_effect(tmp_path):
+@pytest.mark.parametrize("masked", [0.0, 0.3])
+def test_errors_of_poorly_known_unknowns_are_no_missing_effect(tmp_path, masked):
     """They are as fast as the motion: single samples of hold-out runs show them."""
     runs = (("a", 1.0, 0.0002, "fit"), ("d", 1.5, 0.010, "hold-out"), ("e", 1.0, 0.012, "hold-out"))
-    for seed in range(4):
-        state = fitted(tmp_path / str(seed), plain, seed, runs=runs, **MANY)
+    for seed, swings in enumerate((MANY, FEW, MANY, FEW)):
+        state = fitted(tmp_path / str(seed), plain, seed, masked, runs=runs, **swings)
         assert state.at_floor
         assert not state.too_quiet
+
+
+def test_averages_of_masked_samples_are_of_the_others():
+    values, kept = np.arange(12.0), np.ones(12, dtype=bool)
+    kept[[1, 2, 8, 9, 10, 11]] = False
+    np.testing.assert_allclose(local_means(values, kept)[[0, 4, 8]], [1.5, 5.5, 0.0])
+    found = local_average(values, 2.0, kept)
+    # Blocks of two, four and no samples.
+    assert found.noise == pytest.approx(2.0 * np.sqrt((1 / 2 + 1 / 4) / 3))
+    assert (found.samples, found.number, found.differences) == (6, 3, 1)
 
 
 def saturating(x, v, _):
@@ -222,3 +234,23 @@ def test_fits_that_do_not_differ_or_have_no_solution_have_no_noise_between_them(
     base, one, other = models((left, np.full(50, np.nan)))
     assert noise_between(base, one.fit, other.fit) == (1.0, 0.0)
     assert difference.undecided(base, one, other).most == POLICY.equal_likelihood
+
+
+@pytest.mark.parametrize("transients", [False, True])
+def test_white_noise_between_fits_is_that_of_the_samples(tmp_path, transients):
+    """Of periodic runs, and of these beside transients."""
+    records = damper_campaign(tmp_path / "periodic", plain, noise=0.5).records
+    if transients:
+        named = tuple((f"t{run[0]}", *run[1:]) for run in DAMPER_RUNS)
+        more = damper_campaign(tmp_path / "more", plain, noise=0.5, runs=named, transient=True)
+        records = (*records, *more.records)
+    state = fit_state(Assembly(damper(cubic=False)), assign(records), NUMERICS)
+    base = state.base()
+    names = ["quadratic_damping", "cubic_stiffness"]
+    scores = score_all(base, options(state, names), jobs=1)[0]
+    one, other = refit_all(base, scores, NUMERICS)
+    noise, length = noise_between(base, one.fit, other.fit)
+    assert noise_between(base, other.fit, one.fit) == pytest.approx((noise, length))
+    assert length > 0.0
+    # A spectrum of a few lines knows it to a half.
+    assert 1.0 <= noise < 2.0
