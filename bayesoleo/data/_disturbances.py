@@ -61,7 +61,7 @@ _HARMONICS, _FEWEST_LINES = 4, 24
 #: Prior standard deviation of the mean's error over the drift's root mean square. A random walk
 #: from zero has 1.4 of it, a straight line 1.7; one that began before the record has more.
 BASELINE = 5.0
-#: Neighbours that a line must exceed as well, and tones of a channel at most.
+#: Neighbours on either side that a line must exceed as well, and tones of a channel at most.
 _BESIDE, _MOST_TONES = 8, 4
 #: Weighting is worth it where it lowers the variance of the noise below this part.
 _WORTH = 0.9
@@ -178,10 +178,13 @@ def clean(
     tones = none
     smooth = _is_resolved(basis, values - drift)
     if TONE in kinds and smooth:
-        left, found = _without_tones(basis, values - drift, periods, level)
+        # A tone below the fundamental looks like a drift: a drift is no tone, but may hide one.
+        left, found = _without_tones(basis, values, periods, level)
+        if terms and not found:
+            left, found = _without_tones(basis, values - drift, periods, level, 1 + terms // 2)
+            left = left + drift
         if found:
-            tones, what = values - drift - left, replace(what, tones=found)
-            # A tone below the fundamental looks like a drift.
+            tones, what = values - left, replace(what, tones=found)
             drift, terms = drift_of(values - tones) if terms else (none, 0)
     if terms:
         what = replace(what, drift=float(np.sqrt(np.mean(drift**2))), terms=terms)
@@ -325,37 +328,63 @@ def _fitted_drift(basis: HarmonicBasis, number: int, values: Array) -> Array:
 
 
 def _without_tones(
-    basis: HarmonicBasis, values: Array, periods: int, level: float
+    basis: HarmonicBasis, values: Array, periods: int, level: float, slowest: int = 1
 ) -> tuple[Array, tuple[Tone, ...]]:
-    """A signal without its lines between the harmonics, and those, in cycles a sample."""
+    """A signal without its lines between the harmonics, and those, in cycles a sample.
+
+    Of lines below the slowest one a drift has taken the noise.
+    """
     tones: list[Tone] = []
-    left = values
+    left = searched = values
     for _ in range(_MOST_TONES):
-        line = foreign_line(left, 1.0, basis.step)
+        line = foreign_line(searched, 1.0, basis.step)
         if line is None or not line.p_value < level:
             break
-        least = LEAST_SHARE * np.ptp(values)
-        if line.amplitude < least or not _stands_out(basis, left, periods, line.frequency, level):
+        if line.amplitude < LEAST_SHARE * np.ptp(values):
             break
-        (frequency, amplitude), wave = _fitted_tone(basis, left, line.frequency)
-        left = left - wave
-        tones.append(Tone(frequency, amplitude))
+        (frequency, amplitude), wave = _fitted_tone(basis, searched, line.frequency)
+        searched = searched - wave
+        tone = Tone(frequency, amplitude)
+        if _stands_out(basis, left - wave, tone, wave, periods, level, slowest):
+            left = left - wave
+            tones.append(tone)
     return left, tuple(tones)
 
 
 def _stands_out(
-    basis: HarmonicBasis, values: Array, periods: int, frequency: float, level: float
+    basis: HarmonicBasis,
+    left: Array,
+    tone: Tone,
+    wave: Array,
+    periods: int,
+    level: float,
+    slowest: int,
 ) -> bool:
-    """Whether a line exceeds its next neighbours too: what falls with frequency is no tone."""
-    power = np.abs(scipy.fft.rfft(values - basis.fit(values))) ** 2
-    line = np.arange(power.size)
-    centre = round(frequency * values.size)
-    # A tone between two lines is in both of them, and a twentieth of it in the third one.
-    apart = np.where((line % periods != 0) & (np.abs(line - centre) > 2), np.abs(line - centre),
-                     power.size + centre)  # fmt: skip
-    beside = np.argsort(apart, kind="stable")[:_BESIDE]
-    ratio = power[centre] / max(float(power[beside].mean()), 1e-300)
-    return bool(stats.f.sf(ratio, 2, 2 * _BESIDE) < level)
+    """Whether a line exceeds what is left beside it when it is gone, on either side.
+
+    What falls with frequency exceeds the faster lines alone, and is no tone: both comparisons must
+    show it (Berger 1982, Technometrics 24(4), 295-300). Noise that is made of lines itself has
+    neighbours whose powers scatter more than those of normal noise, and are known as if they were
+    fewer: its highest line is no tone either. It would leave too little noise at the harmonics, of
+    which as many hold a line that nobody sees.
+    """
+    after, before = (
+        np.abs(scipy.fft.rfft(part - basis.fit(part))) ** 2 for part in (left, left + wave)
+    )
+    line, centre = np.arange(after.size), round(tone.frequency * left.size)
+    free = (line % periods != 0) & (line >= slowest)
+    below = after[free & (line < centre - 1)][-_BESIDE:]
+    above = after[free & (line > centre + 1)][:_BESIDE]
+    if not (below.size and above.size):
+        return False
+    means = [max(float(side.mean()), 1e-300) for side in (below, above)]
+    ratios = np.concatenate([below / means[0], above / means[1]])
+    dispersion = max(1.0, float(np.sum((ratios - 1.0) ** 2)) / max(ratios.size - 2, 1))
+    highest = float(before[max(centre - 1, 0) : centre + 2].max())
+    return all(
+        stats.f.sf(highest / mean, 2, 2 * side.size / dispersion) < level
+        for side, mean in zip((below, above), means, strict=True)
+    )
 
 
 def _fitted_tone(

@@ -5,8 +5,11 @@ samples of one period determine. Folding by linear interpolation smooths the noi
 underestimates it by a fifth where the number of samples per period is not whole.
 
 A repeating signal has lines at the harmonics only. A record of P periods has P - 1 lines between
-two harmonics, which hold noise alone. Their average over neighbours is the noise *at* the
-harmonics, whether it is flat or not.
+two harmonics, which hold noise alone. The noise *at* a harmonic is interpolated between the mean of
+the lines below it and the mean of those above, even where a removed drift has left fewer of the
+former: a slope of the spectrum then cancels. The power of a line of normal noise scatters as much
+as its mean. Where it scatters more, as where noise is made of a few lines, the average is known
+with fewer degrees of freedom.
 
 A transient has no periods to average over. Its noise is estimated as the error of a local
 polynomial prediction. The model error is smooth on the scale of the samples and noise is not, so
@@ -16,7 +19,10 @@ larger where one is.
 References
 ----------
 Pintelon and Schoukens (2012), System Identification: A Frequency Domain Approach, sections 2.5
-and 3.5; Satterthwaite (1946), Biometrics Bulletin 2(6), 110-114, for degrees of freedom.
+and 3.5; Fan and Gijbels (1996), Local Polynomial Modelling and Its Applications, section 3.2, for
+averages in which a slope cancels; Satterthwaite (1946), Biometrics Bulletin 2(6), 110-114, for
+degrees of freedom; McCullagh and Nelder (1989), Generalized Linear Models, section 8.3, for a
+dispersion that is estimated from the scatter.
 """
 
 from __future__ import annotations
@@ -346,12 +352,16 @@ class NoiseSpectrum:
         Number N of samples.
     emptied : ndarray of bool, shape (N // 2 + 1,), optional
         Lines that say nothing of the noise, because something was removed there.
+    dispersion : ndarray, shape (N // 2 + 1,), optional
+        Variance of the powers of the lines next to each line over that in normal noise; by default
+        one.
     """
 
     level: Array
     lines: int
     samples: int
     emptied: NDArray[np.bool_] | None = None
+    dispersion: Array | None = None
 
     @cached_property
     def weights(self) -> Array:
@@ -393,24 +403,14 @@ class NoiseSpectrum:
 
     def freedom(self, power: Array) -> float:
         """Degrees of freedom of ``power @ level``: few lines have said what the level is."""
-        used, low, high, counts = self._neighbours
-        share, size = power / counts, self.level.size + 1
-        spread = np.bincount(low, share, size) - np.bincount(high, share, size)
-        measured = np.where(used, np.cumsum(spread)[:-1] * self.level, 0.0)
-        scatter = float(np.sum(2.0 * measured**2 / self.weights))
+        measured = self._neighbours.received(power) * self.level
+        scattered = 1.0 if self.dispersion is None else self.dispersion
+        scatter = float(np.sum(2.0 * scattered * measured**2 / self.weights))
         return 2.0 * float(measured.sum()) ** 2 / scatter if scatter > 0 else 0.0
 
     @cached_property
-    def _neighbours(
-        self,
-    ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64], Array]:
-        """Which lines say what the noise is; by line, the first of those that say what its level
-        is, the first beyond them, and their number."""
-        used = ~self._harmonic()
-        if self.emptied is not None:
-            used = used & ~self.emptied
-        low, high = _windows(self.level.size, self.lines, self.emptied)
-        return used, low, high, np.maximum(_between(used.astype(float), low, high), 1.0)
+    def _neighbours(self) -> _Neighbours:
+        return _Neighbours(self.level.size, self.lines, self.emptied)
 
 
 def noise_spectrum(
@@ -429,35 +429,127 @@ def noise_spectrum(
     """
     size = rest.size
     power = np.abs(scipy.fft.rfft(rest)) ** 2 / size
-    free = np.arange(power.size) % periods != 0
-    free = free if emptied is None else free & ~emptied
-    used = free.astype(float)
-    low, high = _windows(power.size, periods, emptied)
-    level = _between(power * used, low, high) / np.maximum(_between(used, low, high), 1.0)
-    return NoiseSpectrum(level, periods, size, emptied)
+    beside = _Neighbours(power.size, periods, emptied)
+    level = beside.mean(power)
+    return NoiseSpectrum(level, periods, size, emptied, beside.dispersion(power, level))
+
+
+class _Neighbours:
+    """Lines that say what the noise at each line is.
+
+    The level is interpolated linearly between the mean of those below a line and the mean of those
+    above it, so that a slope of the spectrum cancels, however many are left on either side. Where
+    one side has none, the other one stands alone. Below the fundamental, where zero cuts one side
+    short, all lines count alike.
+
+    Parameters
+    ----------
+    size : int
+        Number of lines.
+    periods : int
+        Lines from one harmonic to the next.
+    emptied : ndarray of bool, shape (size,), or None
+        Lines that say nothing of the noise.
+    """
+
+    def __init__(self, size: int, periods: int, emptied: NDArray[np.bool_] | None) -> None:
+        line = np.arange(size)
+        used = line % periods != 0
+        used = used if emptied is None else used & ~emptied
+        self.used = used.astype(float)
+        low, middle, high = _windows(size, periods, emptied)
+        #: Lines from and to before which they are, below and above.
+        self.sides = ((low, middle), (middle, high))
+        self.counts = [_between(self.used, *side) for side in self.sides]
+        places = [
+            _between(line * self.used, *side) / np.maximum(count, 1.0)
+            for side, count in zip(self.sides, self.counts, strict=True)
+        ]
+        cut = high - middle > middle - low + 1
+        self.parts = _interpolating(middle, cut, *places, *self.counts)
+        #: All of them, and those beyond the means of the sides.
+        self.number = np.sum(self.counts, axis=0)
+        self.free = self.number - np.sum([count > 0 for count in self.counts], axis=0)
+
+    def mean(self, values: Array) -> Array:
+        """Mean over the neighbours of each line, by which the level is interpolated."""
+        sums = [
+            part * _between(values * self.used, *side)
+            for part, side in zip(self.parts, self.sides, strict=True)
+        ]
+        return np.asarray(np.sum(sums, axis=0))
+
+    def received(self, values: Array) -> Array:
+        """What each line receives if every line's value is taken from its neighbours."""
+        change = np.zeros(values.size + 1)
+        for part, (low, high) in zip(self.parts, self.sides, strict=True):
+            change += np.bincount(low, values * part, change.size)
+            change -= np.bincount(high, values * part, change.size)
+        return np.asarray(self.used * np.cumsum(change)[:-1])
+
+    def dispersion(self, power: Array, level: Array) -> Array:
+        """Variance of the neighbours' powers about the mean of their side, over the squared level.
+
+        It is one in normal noise, whose powers are exponentially distributed; less is chance.
+        """
+        variance = self.mean(power**2)
+        for part, count, side in zip(self.parts, self.counts, self.sides, strict=True):
+            variance -= part * _between(power * self.used, *side) ** 2 / np.maximum(count, 1.0)
+        variance *= self.number / np.maximum(self.free, 1.0)
+        known = (self.free > 0) & (level > 0)
+        ratio = np.divide(variance, level**2, out=np.ones_like(level), where=known)
+        return np.maximum(ratio, 1.0)
+
+
+def _interpolating(
+    middle: NDArray[np.int64],
+    cut: NDArray[np.bool_],
+    below: Array,
+    above: Array,
+    fewer: Array,
+    more: Array,
+) -> tuple[Array, Array]:
+    """Part of each line's power in the level of the middle, by side.
+
+    Parameters
+    ----------
+    middle : ndarray of int, shape (K,)
+    cut : ndarray of bool, shape (K,)
+        Where all lines count alike.
+    below, above : ndarray, shape (K,)
+        Mean places of the lines on either side.
+    fewer, more : ndarray, shape (K,)
+        Their numbers.
+    """
+    both = (fewer > 0) & (more > 0) & ~cut
+    share = more / np.maximum(fewer + more, 1.0)
+    share[both] = ((middle - below) / np.where(both, above - below, 1.0))[both]
+    return (1.0 - share) / np.maximum(fewer, 1.0), share / np.maximum(more, 1.0)
 
 
 def _windows(
     size: int, periods: int, emptied: NDArray[np.bool_] | None
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First line of each line's neighbourhood, and the first beyond it.
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """First line of each line's neighbourhood, its middle, and the first beyond it.
 
     Where a neighbourhood has emptied lines only, it is that of the next line that has another.
     """
     line = np.arange(size)
     half = np.maximum(HARMONICS * periods, PART * line).astype(np.int64)
+    # As many lines above as below up to half the sampling rate: nothing is extrapolated there.
+    half = np.minimum(half, np.maximum(periods, size - 1 - line))
     half[:1] = max(1, int(AT_MEAN * periods))
     high = np.minimum(line + half + 1, size)
     low = np.maximum(line - half, 0)
     if emptied is None:
-        return low, high
+        return low, line, high
     used = (line % periods != 0) & ~emptied
     known = np.flatnonzero(_between(used.astype(float), low, high) > 0)
     if not known.size:
-        return low, high
+        return low, line, high
     # Lines are emptied from the slowest on, so that the next faster one is the nearest.
     nearest = known[np.clip(np.searchsorted(known, line), 0, known.size - 1)]
-    return low[nearest], high[nearest]
+    return low[nearest], nearest, high[nearest]
 
 
 def _between(values: Array, low: NDArray[np.int64], high: NDArray[np.int64]) -> Array:

@@ -459,8 +459,9 @@ def emptied_lines(record: Record, channel: str) -> NDArray[np.bool_] | None:
         return None
     span = record.periods / record.frequency
     line = np.arange(record.time.size // 2 + 1)
-    # A cosine of k half cycles lies at the line k / 2; the last one is emptied in part only.
-    found = line < 0.5 * what.terms
+    # A cosine of k half cycles lies at the line k / 2. The last one takes two thirds of that line,
+    # and next to nothing of the line after it.
+    found = line <= 0.5 * what.terms
     for tone in what.tones:
         found = found | (np.abs(line - tone.frequency * span) < 0.75)
     return np.asarray(found)

@@ -1,7 +1,10 @@
 """The noise at harmonics, from what lies between them: laws of white and of coloured noise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy import stats
 
 from bayesoleo.data import periodic_average
 from bayesoleo.data._noise import NoiseSpectrum, noise_spectrum
@@ -42,7 +45,11 @@ def test_white_noise_keeps_its_degrees_of_freedom():
     average, spectrum = average_and_spectrum(rng.standard_normal(SAMPLES))
     # Estimated levels scatter, which costs a few.
     assert spectrum.coefficients == pytest.approx(average.number, rel=0.05)
-    assert spectrum.free == pytest.approx(SAMPLES - average.number, rel=0.15)
+    # Near half the sampling rate fewer lines are averaged, which costs a tenth. Where powers
+    # scatter more by chance it is counted, where they scatter less it is not: as much again.
+    free = SAMPLES - average.number
+    assert replace(spectrum, dispersion=None).free == pytest.approx(free, rel=0.2)
+    assert 0.6 * free < spectrum.free < free
     assert spectrum.noise == pytest.approx(average.noise, rel=0.03)
 
 
@@ -79,3 +86,65 @@ def test_the_power_of_all_lines_is_that_of_the_signal(size):
     spectrum = NoiseSpectrum(np.ones(size // 2 + 1), 4, size)
     assert spectrum.power(signal).sum() == pytest.approx(signal @ signal, rel=1e-12)
     assert spectrum.weights.sum() == size
+
+
+def with_powers(powers, size):
+    """A signal whose lines have these powers and no phase."""
+    return np.fft.irfft(np.sqrt(size * powers), size)
+
+
+@pytest.mark.parametrize("first", [1, 4, 7], ids=["all", "half", "the last"])
+def test_a_slope_cancels_however_many_lines_are_left_below(first):
+    """Power in proportion to frequency: at the first harmonics the level is the line's own."""
+    periods, size = 8, 800
+    line = np.arange(size // 2 + 1)
+    emptied = line < first
+    powers = np.where(emptied | (line % periods == 0), 0.0, 1.0 * line)
+    level = noise_spectrum(with_powers(powers, size), periods, emptied).level
+    np.testing.assert_allclose(level[[periods, 2 * periods]], [periods, 2 * periods], rtol=1e-9)
+
+
+def test_the_freedom_of_a_level_is_that_by_which_it_scatters():
+    """``power @ level`` is linear in the powers: its variance follows from what each line gives."""
+    periods, size = 6, 600
+    emptied = np.arange(size // 2 + 1) < 3
+    spectrum = NoiseSpectrum(np.ones(size // 2 + 1), periods, size, emptied)
+    wanted = np.zeros(size // 2 + 1)
+    wanted[[periods, 3 * periods]] = 1.0, 2.0
+    slope = []
+    for k in range(4 * periods):
+        powers = np.zeros(size // 2 + 1)
+        powers[k] = 1.0
+        slope.append(wanted @ noise_spectrum(with_powers(powers, size), periods, emptied).level)
+    # Each power is a chi-square variate of two degrees of freedom over two.
+    free = 2 * np.sum(slope) ** 2 / np.sum(np.square(slope))
+    assert spectrum.freedom(wanted) == pytest.approx(free, rel=1e-9)
+
+
+def lines_at_random(rng, size, periods):
+    """Twelve sinusoids anywhere between a third of the fundamental and three times it."""
+    places = periods / size * rng.uniform(0.3, 3.0, 12)
+    turns = 2 * np.pi * np.outer(places, np.arange(size)) + rng.uniform(0, 2 * np.pi, (12, 1))
+    return rng.standard_normal(12) @ np.sin(turns) + 0.02 * rng.standard_normal(size)
+
+
+@pytest.mark.parametrize(("noise", "free"), [("white", (14, 20)), ("lines", (4, 10))])
+def test_noise_made_of_lines_is_known_with_few_degrees_of_freedom(noise, free):
+    """F variates of the first three harmonics: few lie beyond the highest one in a thousand."""
+    rng, periods, size = np.random.default_rng(5), 6, 600
+    p_values, freedom = [], []
+    for _ in range(200):
+        white = noise == "white"
+        signal = rng.standard_normal(size) if white else lines_at_random(rng, size, periods)
+        average = periodic_average(signal, 1.0, periods / size)
+        spectrum = noise_spectrum(signal - average.values, periods)
+        for k in periods * np.array([1, 2, 3]):
+            ratio = np.abs(np.fft.rfft(signal)[k]) ** 2 / size / spectrum.level[k]
+            freedom.append(spectrum.freedom(1.0 * (np.arange(size // 2 + 1) == k)))
+            p_values.append(stats.f.sf(ratio, 2, freedom[-1]))
+    # Ten lines of two, less what chance takes; twelve sinusoids of random size are some six normal
+    # variates.
+    assert free[0] < np.median(freedom) < free[1]
+    # Of six hundred white ones, five or more come once in 2000 times. Lines have heavier tails than
+    # any normal noise; judged by ten lines of two degrees, 25 of theirs were beyond.
+    assert np.sum(np.array(p_values) < 0.001) < (5 if white else 14)
