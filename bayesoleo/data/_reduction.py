@@ -14,7 +14,7 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from bayesoleo._parallel import thread_map
+from bayesoleo._parallel import single_blas_thread, thread_map
 from bayesoleo._types import Array
 from bayesoleo.data._campaign import CampaignData
 from bayesoleo.data._fourier import HarmonicBasis
@@ -173,6 +173,7 @@ def reduce_campaign(
     return ReducedCampaign(campaign, records)
 
 
+@single_blas_thread()  # matrices are small: threads take longer to meet than to work
 def reduce_run(run: Run) -> Record:
     """Reduce one run.
 

@@ -41,8 +41,10 @@ DIFFUSE = 1e9
 _END, _BEYOND = 8.0, 8.0
 #: The same of the end that follows from the spectrum, with its fewest and most samples; part of the
 #: cut-off frequency up to which its lines count; size of its mean and slope over the signal's; its
-#: weakest line and smallest noise over the signal's, in power and in size.
+#: weakest line and smallest noise over the signal's, in power and in size; most lines for each
+#: sample, since what lies closer together is one line within so few samples.
 _KNOWN, _FEWEST, _MOST, _PASSED, _FREE, _LEAST, _SMALLEST = 16.0, 32, 256, 1.5, 10.0, 1e-9, 1e-7
+_LINES = 8
 #: Roughness of a spline that goes through its samples, to 3e-5; more would compete with the start,
 #: of which nothing is known.
 _EXACT = 1e7
@@ -304,9 +306,10 @@ def _end_by_spectrum(values: Array, step: float, cut: float, noise: float) -> Ar
     beyond = power[omega > 2.0 * np.pi * _PASSED * cut]
     if beyond.size:  # what is cut off is noise here, also where nobody could tell it from signal
         noise = max(noise, float(np.sqrt(0.5 * size * beyond.mean())))
-    omega, power = omega[chosen], power[chosen]
     # Less the noise's own share of each line; what is left is never quite nothing.
-    amplitude = np.sqrt(np.maximum(power - 2.0 * noise**2 / size, _LEAST * spread**2 / size))
+    power = np.maximum(power[chosen] - 2.0 * noise**2 / size, _LEAST * spread**2 / size)
+    omega, power = _in_groups(omega[chosen], power, _LINES * count)
+    amplitude = np.sqrt(power)
     time = step * np.arange(count)
     turn = np.multiply.outer(omega, time)
     cosine, sine = (amplitude[:, None] * part(turn) for part in (np.cos, np.sin))
@@ -322,6 +325,19 @@ def _end_by_spectrum(values: Array, step: float, cut: float, noise: float) -> Ar
     states = np.stack([weights @ part for part in (rows, rates, bends)], axis=1)
     states[:, 0] += centre
     return states
+
+
+def _in_groups(omega: Array, power: Array, most: int) -> tuple[Array, Array]:
+    """Lines of a spectrum, neighbours together where there are more than so many.
+
+    The sum of their power, at its mean frequency: what is much shorter than the record cannot tell
+    them from each other.
+    """
+    if omega.size <= most:
+        return omega, power
+    first = np.linspace(0, omega.size, most, endpoint=False).astype(int)
+    together = np.add.reduceat(power, first)
+    return np.add.reduceat(omega * power, first) / together, together
 
 
 def _transformed(

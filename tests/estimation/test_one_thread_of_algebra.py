@@ -9,6 +9,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from bayesoleo._parallel import ONE_THREAD, single_blas_thread
 from bayesoleo._session.display import kept
+from bayesoleo.data._reduction import reduce_run
+from bayesoleo.data._run_samples import Run
 from bayesoleo.estimation import FunctionProblem, estimate
 from bayesoleo.model._priors import Normal
 
@@ -40,6 +42,17 @@ def test_an_estimate_decomposes_in_the_calling_thread(seen):
     problem = FunctionProblem(lambda x, t: x @ t, design, data, [Normal(0.0, 5.0)] * 2)
     with threadpool_limits(2, user_api="blas"):
         assert estimate(problem, "be").status.ok
+    assert seen
+    assert set(seen) == {1}
+
+
+def test_a_transient_is_reduced_in_the_calling_thread(seen):
+    """One run, as several on as many threads: the curve's ends are decompositions."""
+    rng, time = np.random.default_rng(0), 1e-3 * np.arange(4000)
+    values = np.sin(2 * np.pi * 3.0 * time) + 1e-4 * rng.standard_normal(time.size)
+    run = Run("1", "1.csv", "1", "fit", "transient", None, time, {"position": values})
+    with threadpool_limits(2, user_api="blas"):
+        reduce_run(run)
     assert seen
     assert set(seen) == {1}
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from bayesoleo.prediction import _filtering
 from bayesoleo.prediction._band_limited import (
     band_limited,
     band_limited_channels,
@@ -211,3 +212,29 @@ def test_ends_of_a_declared_band_do_not_follow_noise():
         error = declared(seen, 0.02, 3.0).at(time, 2) - bends
         squares.append(np.r_[error[:5], error[-5:]] / bends.std())
     assert rms(squares) < 0.3
+
+
+@pytest.mark.parametrize("noise", [1e-6, 1e-3])
+def test_the_ends_of_a_long_record_need_no_line_of_each_of_its_harmonics(noise, monkeypatch):
+    """A record of 60 s has 7 200 lines up to where its ends are looked at, and an end is 0.2 s."""
+    rng, time = np.random.default_rng(2), STEP * np.arange(60_000)
+    phases = rng.uniform(0.0, 2 * np.pi, 30)
+    motion = sum(np.sin(2 * np.pi * (k + 0.37) * time + x) for k, x in enumerate(phases))
+    values = motion + noise * rng.standard_normal(time.size)
+    seen, svd = [], np.linalg.svd
+
+    def watched(rows, **options):
+        seen.append(rows.shape)
+        return svd(rows, **options)
+
+    monkeypatch.setattr(np.linalg, "svd", watched)
+    grouped = _filtering._end_by_spectrum(values, STEP, 80.0, noise)
+    lines = _filtering._LINES
+    monkeypatch.setattr(_filtering, "_LINES", time.size)
+    each = _filtering._end_by_spectrum(values, STEP, 80.0, noise)
+    (few, samples), (many, _) = seen
+    assert few == 2 * lines * samples + 2
+    assert many == 2 * 7200 + 2
+    # Far below the noise that the samples have themselves.
+    assert rms(grouped[:, 0] - each[:, 0]) < 0.01 * noise
+    assert rms(grouped[:, 2] - each[:, 2]) < 1e-3 * rms(each[:, 2])
