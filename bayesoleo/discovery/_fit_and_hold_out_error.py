@@ -43,7 +43,7 @@ from bayesoleo.discovery._fit import counted, of_those_counted, weights, without
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._run_predictions import Prediction, borne_out, sample_noise
 from bayesoleo.prediction._records import Record
-from bayesoleo.prediction._run_errors import input_columns
+from bayesoleo.prediction._run_errors import errors_known, input_columns
 
 Noise = Mapping[tuple[str, str], RecordNoise]
 
@@ -284,7 +284,8 @@ def compared(
         residual, SI.
     """
     record, predictor = prediction.record, prediction.predictor
-    columns = input_columns(predictor.runs[0], predictor.constants(prediction.vector[None], 0)[0])
+    run = predictor.runs[0]
+    columns = input_columns(run, predictor.constants(prediction.vector[None], 0)[0])
     left = [record.samples[o] - prediction.y[b] for b, o in enumerate(predictor.outputs)]
     averages, spectra, before, shown = [], [], list[RecordNoise | None](), []
     for output, rest in zip(predictor.outputs, left, strict=True):
@@ -298,7 +299,8 @@ def compared(
     spread, of_samples = (
         np.sqrt(np.mean(np.sum(part**2, axis=1), axis=1)) for part in (averaged, columns)
     )
-    scale = borne_out(columns, shown, drawn=not record.periodic, policy=policy)
+    drawn = not (record.periodic and errors_known(run))
+    scale = borne_out(columns, shown, drawn=drawn, policy=policy)
     factors = [_factor(scale, size, known) for size, known in zip(spread, before, strict=True)]
     entries = [
         RunError(

@@ -60,7 +60,7 @@ def borne_out(
         What the average over periods (or neighbouring samples) leaves of each output.
     drawn : bool
         Whether columns are draws of an error with as many coefficients as samples, as those of a
-        transient's input are, instead of one coefficient each.
+        transient's input are, or sums of many coefficients, instead of one coefficient each.
     policy : SearchPolicy
 
     Returns

@@ -2,8 +2,9 @@
 
 The harmonics of an input are known with a variance each. The resulting error of the prediction
 repeats in every period, so the scatter between periods does not contain it. It is computed by the
-same linear problem that gives parameter sensitivities. The smooth input of a transient has an error
-at every sample; a few draws of it represent its covariance.
+same linear problem that gives parameter sensitivities. Of a broadband input with thousands of
+harmonics, neighbours stand together. The smooth input of a transient has an error at every sample;
+a few draws of it represent its covariance.
 
 The mesh of a run is frozen, so that a log density is the same function everywhere. Its
 discretisation error is estimated once, at the point estimate.
@@ -43,7 +44,8 @@ from bayesoleo.solvers._transient import moved_from_start
 
 #: Draws of the error of a transient's input. The root mean square of so many is known to 20 %.
 DRAWS = 16
-#: Lines of the noise that a curve of a transient's input holds, up to which each is one error.
+#: Lines of the noise that a curve of a transient's input holds, and parts of the harmonics of an
+#: input of a periodic run, up to which each is one error.
 MOST_LINES = 256
 #: Error over the swing below which nothing more is resolved: what no channel shows.
 TOLERANCE = 1e-6
@@ -68,7 +70,8 @@ def input_columns(run: RunPredictor, p: Array) -> Array:
     Returns
     -------
     ndarray, shape (ny, k, N)
-        Real and imaginary parts of all significant harmonics of all inputs; of a transient the
+        Real and imaginary parts of all significant harmonics of all inputs, of very many some
+        neighbours together, see :func:`errors_known`; of a transient the
         lines of the noise that its inputs hold, or where these are too many draws over the root of
         their number, and the errors of channels that its start is read from; SI; no columns where
         the run could not be solved.
@@ -278,17 +281,27 @@ class _Lines:
 def _harmonic_changes(
     item: Harmonics, frequency: float, derivatives: Sequence[int], phase: Array
 ) -> Array:
-    """The same by the counted parts of harmonics, shape (derivatives, k, N)."""
+    """The same by the counted parts of harmonics, shape (derivatives, k, N).
+
+    Of more than :data:`MOST_LINES` parts some neighbours are one column, their sum with random
+    signs. Sums and mean squares over all columns have the same expectation as over all parts (a
+    sketch by random signs: Charikar, Chen and Farach-Colton 2002), and those of a linear answer
+    over a period the same value, since its harmonics are orthogonal.
+    """
     count, kept = item.orders.size, counted_parts(item, derivatives)
-    place = np.cumsum(kept) - 1
-    found = np.zeros((len(derivatives), int(kept.sum()), phase.size))
-    factors = zip(item.orders, np.sqrt(item.variances), _turns(item.orders, phase), strict=True)
+    place, whole = np.cumsum(kept) - 1, int(kept.sum())
+    size = np.sqrt(item.variances)
+    if whole > MOST_LINES:
+        place = place * MOST_LINES // whole
+        size = size * np.random.default_rng(0).choice([-1.0, 1.0], count)
+    found = np.zeros((len(derivatives), min(whole, MOST_LINES), phase.size))
+    factors = zip(item.orders, size, _turns(item.orders, phase), strict=True)
     for j, (order, sd, turn) in enumerate(factors):
         for k, derivative in enumerate(derivatives):
             changed = (2j * np.pi * frequency * order) ** derivative * sd * turn
             for at, part in ((j, changed.real), (count + j, -changed.imag)):
                 if kept[at]:
-                    found[k, place[at]] = part
+                    found[k, place[at]] += part
     return found
 
 
@@ -395,11 +408,19 @@ def _noise_lines(curve: Smoothed, span: float, samples: int) -> tuple[Array, Arr
 
 
 def errors_known(run: RunPredictor) -> bool:
-    """Whether the columns of :func:`input_columns` are all errors of the inputs, and not draws."""
-    record, highest = run.record, highest_derivatives(run.kernels.derived.inputs)
-    if record.periodic:
-        return True
+    """Whether the columns of :func:`input_columns` are all errors of the inputs, each by itself,
+    and not draws or sums of them."""
+    rows = run.kernels.derived.inputs
+    record, highest = run.record, highest_derivatives(rows)
     channels = [name for name in run.model.inputs if name in highest]
+    if record.periodic:
+        orders = {name: [k for channel, k in rows if channel == name] for name in channels}
+        items = [harmonics_of(record, name).for_derivative(highest[name]) for name in channels]
+        counts = [
+            counted_parts(item, orders[name]).sum()
+            for name, item in zip(channels, items, strict=True)
+        ]
+        return max(counts, default=0) <= MOST_LINES
     curves = [cast(Smoothed, signal_of(record, name, highest[name])) for name in channels]
     return all(
         c.noise == 0.0 or _noise_lines(c, record.span, record.time.size) is not None for c in curves
