@@ -296,7 +296,7 @@ class _Judge:
         record, outputs = self._blank(run), self.rivals[0].fit.predictor.outputs
         solved, known = [], []
         for k, rival in enumerate(self.rivals):
-            known.append(self._known(rival.fit, run))
+            known.append(self._known(rival.fit, run, record.periodic))
             begin = self._begin(k, run.like) if isinstance(run, Variation) else None
             found = predictive_distribution(rival.fit, known[-1], record, self.noise, begin)
             if isinstance(found, Status):
@@ -321,10 +321,10 @@ class _Judge:
             self.begins[key] = solved_like(fit, known, self.records, label)
         return self.begins[key]
 
-    def _known(self, fit: ModelFit, run: Run) -> Knowledge:
+    def _known(self, fit: ModelFit, run: Run, periodic: bool) -> Knowledge:
         if isinstance(run, Variation):
-            return Knowledge.of(fit, run.like, run.start)
-        return Knowledge.of(fit)
+            return Knowledge.of(fit, run.like, run.start, periodic=periodic)
+        return Knowledge.of(fit, periodic=periodic)
 
     def _told(
         self, solved: Sequence[PredictiveDistribution], known: Sequence[Knowledge]

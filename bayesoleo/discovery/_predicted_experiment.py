@@ -430,7 +430,9 @@ class Knowledge:
     names: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, fit: ModelFit, like: str = "", start: float = 1.0) -> Knowledge:
+    def of(
+        cls, fit: ModelFit, like: str = "", start: float = 1.0, *, periodic: bool = False
+    ) -> Knowledge:
         """The distribution by the fit. Shared parameters have their posterior, by-run parameters
         the scatter between the runs, or their priors where there are few runs.
 
@@ -442,9 +444,11 @@ class Knowledge:
             transient is known no better than by its prior.
         start : float
             Factor of that run's estimated start.
+        periodic : bool
+            Whether the new run is periodic, so that it has no start.
         """
         model = fit.model
-        layout = Layout.of(model, ["any"])
+        layout = Layout.of(model, ["any"], [periodic])
         values, names = fit.values, fit.problem.names
         theta = layout.start(model)
         covariance = np.diag([float(prior.sd) ** 2 for prior in layout.priors(model)])

@@ -464,7 +464,7 @@ def quick_fit(
 
 def start_from(fit: ModelFit, known: Mapping[str, float], model: Model) -> Array:
     """Known values inside the priors' support, and else nominal ones."""
-    layout = Layout.of(model, [record.label for record in fit.records])
+    layout = Layout.of_records(model, fit.records)
     start = layout.start(model)
     priors = layout.priors(model)
     for k, name in enumerate(layout.names):

@@ -62,7 +62,7 @@ class ShootingProblem:
     ) -> ShootingProblem:
         """Cut records into steps, and these into intervals of at least a length in seconds."""
         layout = Layout.of(model, [record.label for record in records])
-        compiled = kernels(model, layout.active, backend)
+        compiled = kernels(model, model.estimated(), backend)
         runs = tuple(
             SegmentedRun(model, compiled, record, n, scheme)
             for record, n in zip(records, steps, strict=True)
@@ -111,7 +111,7 @@ class ShootingProblem:
         """Constants of a run, shape (np,)."""
         run = self.runs[r]
         p = run.base_constants()
-        places = [run.kernels.derived.constants.index(name) for name in self.layout.active]
+        places = [run.kernels.derived.constants.index(name) for name in self.layout.active[r]]
         p[places] = theta[self.layout.columns[r]]
         return p
 

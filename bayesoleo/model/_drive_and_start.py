@@ -28,6 +28,7 @@ from functools import lru_cache
 import sympy as sp
 
 from bayesoleo.errors import ModelError
+from bayesoleo.model._derivatives import derive
 from bayesoleo.model._expressions import (
     TIME,
     derivative_symbol,
@@ -313,6 +314,20 @@ def undeclared_starts(model: Model) -> tuple[str, ...]:
     return tuple(
         name for name, dof in model.dofs.items() if dof.initial is None and dof.initial_rate is None
     )
+
+
+def start_parameters(model: Model) -> frozenset[str]:
+    """Parameters on which the starts of dofs depend, and nothing else: a periodic run has none of
+    them."""
+    declared = set(model.dofs) - set(undeclared_starts(model))
+    begins = [start_of(model, name) for name in declared]
+    starts = {item.name for one in begins for e in (one.value, one.rate) for item in e.free_symbols}
+    alone = starts & set(model.parameters)
+    if not alone:
+        return frozenset()
+    found = derive(model)
+    rest = (*found.residual, *found.output, *found.admissible)
+    return frozenset(alone - {item.name for e in rest for item in e.free_symbols})
 
 
 def with_estimated_starts(model: Model) -> Model:

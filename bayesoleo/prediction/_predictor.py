@@ -14,6 +14,7 @@ import numpy as np
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array, Float, Int, Integers
 from bayesoleo.errors import ModelError
+from bayesoleo.model._drive_and_start import start_parameters
 from bayesoleo.model._kernels import kernels
 from bayesoleo.model._model import Model
 from bayesoleo.model._priors import Prior
@@ -40,35 +41,55 @@ class Layout:
         The model's parameter behind each unknown.
     runs : tuple of str
         Labels of the runs.
-    columns : ndarray of int, shape (N, na)
-        For each run, the unknown behind each active parameter.
-    active : tuple of str
-        Estimated parameters in the model's order.
+    columns : tuple of ndarray of int, shape (na,)
+        For each run, the unknown behind each of its active parameters.
+    active : tuple of tuple of str
+        For each run, the estimated parameters that it depends on, in the model's order: a periodic
+        run has no start.
     """
 
     names: tuple[str, ...]
     parameters: tuple[str, ...]
     runs: tuple[str, ...]
-    columns: Integers
-    active: tuple[str, ...]
+    columns: tuple[Integers, ...]
+    active: tuple[tuple[str, ...], ...]
 
     @classmethod
-    def of(cls, model: Model, runs: Sequence[str]) -> Layout:
-        """Layout of a model's estimated parameters over runs."""
+    def of(cls, model: Model, runs: Sequence[str], periodic: Sequence[bool] = ()) -> Layout:
+        """Layout of a model's estimated parameters over runs.
+
+        Parameters
+        ----------
+        model : Model
+        runs : sequence of str
+            Their labels.
+        periodic : sequence of bool, optional
+            Which of them are periodic; by default none.
+        """
+        kinds = list(periodic) or [False] * len(runs)
+        starts = start_parameters(model) if any(kinds) else frozenset()
+        active = [
+            tuple(name for name in model.estimated() if not (kind and name in starts))
+            for kind in kinds
+        ]
         names: list[str] = []
         owners: list[str] = []
-        active = model.estimated()
-        columns = np.empty((len(runs), len(active)), dtype=np.int64)
-        for k, name in enumerate(active):
-            if model.parameters[name].by_run:
-                columns[:, k] = len(names) + np.arange(len(runs))
-                names += [f"{name}[{run}]" for run in runs]
-                owners += [name] * len(runs)
-            else:
-                columns[:, k] = len(names)
-                names.append(name)
-                owners.append(name)
-        return cls(tuple(names), tuple(owners), tuple(runs), columns, active)
+        columns: list[list[int]] = [[] for _ in runs]
+        for name in model.estimated():
+            used = [r for r, own in enumerate(active) if name in own]
+            by_run = model.parameters[name].by_run
+            for k, r in enumerate(used):
+                columns[r].append(len(names) + (k if by_run else 0))
+            new = [f"{name}[{runs[r]}]" for r in used] if by_run else [name]
+            names, owners = names + new, owners + [name] * len(new)
+        places = tuple(np.array(own, dtype=np.int64) for own in columns)
+        return cls(tuple(names), tuple(owners), tuple(runs), places, tuple(active))
+
+    @classmethod
+    def of_records(cls, model: Model, records: Sequence[Record]) -> Layout:
+        """Layout of a model's estimated parameters over measured runs."""
+        labels = [record.label for record in records]
+        return cls.of(model, labels, [record.periodic for record in records])
 
     def priors(self, model: Model) -> tuple[Prior, ...]:
         """Prior of each unknown.
@@ -163,22 +184,25 @@ class Predictor:
             jobs,
         )
         self.backend, self.solver = backend, solver
-        self.layout = Layout.of(model, [record.label for record in records])
-        compiled = kernels(model, self.layout.active, backend)
-        self.outputs = compiled.derived.outputs
+        self.layout = Layout.of_records(model, records)
+        compiled = {own: kernels(model, own, backend) for own in dict.fromkeys(self.layout.active)}
+        self.outputs = tuple(model.outputs)
         shared = {} if share is None else {id(run.record): run for run in share.runs}
 
-        def build(record: Record) -> RunPredictor:
+        def build(item: tuple[Record, tuple[str, ...]]) -> RunPredictor:
+            record, own = item[0], compiled[item[1]]
             like = shared.get(id(record))
             if record.periodic:
                 rows = None if like is None else like.known_rows
                 if solver == COLLOCATION:
-                    return RunPredictor(model, compiled, record, steps, scheme, rows)
-                return SolvedRun(model, compiled, record, steps, scheme, solver, backend, rows)
+                    return RunPredictor(model, own, record, steps, scheme, rows)
+                return SolvedRun(model, own, record, steps, scheme, solver, backend, rows)
             same = like if isinstance(like, TransientRun) else None
-            return TransientRun(model, compiled, record, steps, scheme, same)
+            return TransientRun(model, own, record, steps, scheme, same)
 
-        self.runs: list[RunPredictor] = thread_map(build, self.records, jobs)
+        self.runs: list[RunPredictor] = thread_map(
+            build, list(zip(self.records, self.layout.active, strict=True)), jobs
+        )
         self._base = np.stack([run.base_constants() for run in self.runs])
         #: Of the last evaluation, the first run that could not be solved.
         self._failed: int | None = None

@@ -420,7 +420,7 @@ def errors_known(run: RunPredictor) -> bool:
             counted_parts(item, orders[name]).sum()
             for name, item in zip(channels, items, strict=True)
         ]
-        return max(counts, default=0) <= MOST_LINES
+        return bool(max(counts, default=0) <= MOST_LINES)
     curves = [cast(Smoothed, signal_of(record, name, highest[name])) for name in channels]
     return all(
         c.noise == 0.0 or _noise_lines(c, record.span, record.time.size) is not None for c in curves

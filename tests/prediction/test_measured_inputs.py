@@ -4,13 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from multisines import multisine_campaign, resonance
 
 from bayesoleo.errors import CampaignError
+from bayesoleo.model import Dof, Model, Output, Parameter
 from bayesoleo.model._expressions import within
+from bayesoleo.prediction import _run_errors
 from bayesoleo.prediction._band_limited import declared
 from bayesoleo.prediction._inputs import harmonics_of, input_rows, signal_of
+from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Harmonics, Record, transient_record
-from bayesoleo.prediction._run_errors import counted_parts
+from bayesoleo.prediction._run_errors import counted_parts, errors_known, input_columns
 
 
 def harmonics(**amplitudes):
@@ -106,3 +110,58 @@ def test_noise_moves_an_input_along_every_part_of_its_harmonics_but_that_of_a_me
     # A mean moves the value, and not its rate; what has no noise moves nothing.
     assert counted_parts(item, [0, 1]).tolist() == [True, True, False, False, True, False]
     assert counted_parts(item, [1, 2]).tolist() == [False, True, False, False, True, False]
+
+
+def of_a_multisine(outputs):
+    """A resonator under a force of 700 lines with noise."""
+    (record,) = multisine_campaign(
+        resonance, realisations=1, orders=range(1, 401), input_noise=0.3, noise=1e-3
+    ).records
+    model = Model(
+        "resonator",
+        dofs={"x": Dof("m")},
+        inputs={"force": "N"},
+        parameters={"damping": Parameter(0.1, sd=0.1), "cubic": Parameter(0.0, sd=1.0)},
+        equations={"x": "ddot(x)/125.7**2 + damping*dot(x)/125.7 + x + cubic*x**3 - force"},
+        outputs=outputs,
+    )
+    predictor = Predictor(model, [record], steps=2048, backend="numpy", jobs=1)
+    return predictor, predictor.runs[0]
+
+
+@pytest.mark.parametrize("cubic", [0.0, 0.05])
+def test_many_harmonics_with_noise_are_a_few_columns_of_the_same_size(cubic, monkeypatch):
+    predictor, run = of_a_multisine({"displacement": Output("x", "m")})
+    p = predictor.constants(np.array([[0.1, cubic]]), 0)[0]
+    run.set_anchor(p)
+    few = input_columns(run, p)
+    assert few.shape[1] == _run_errors.MOST_LINES
+    assert not errors_known(run)
+    monkeypatch.setattr(_run_errors, "MOST_LINES", 10_000)
+    every = input_columns(run, p)
+    assert every.shape[1] > 700
+    assert errors_known(run)
+    together, each = (np.sum(part[0] ** 2, axis=0) for part in (few, every))
+    # Harmonics of a linear answer are orthogonal, up to its mesh. A cubic spring mixes neighbours,
+    # and a dozen columns about the resonance hold most of it.
+    assert together.mean() == pytest.approx(each.mean(), rel=1e-6 if cubic == 0.0 else 0.15)
+    # Where in the spectrum it is, a band of lines each.
+    bands = [
+        np.abs(np.fft.rfft(part[0], axis=1)[:, : 4 * 400].reshape(len(part[0]), 40, -1)) ** 2
+        for part in (few, every)
+    ]
+    sums = [band.sum(axis=(0, 2)) for band in bands]
+    np.testing.assert_allclose(sums[0], sums[1], rtol=1e-5 if cubic == 0.0 else 0.5)
+
+
+def test_few_harmonics_keep_a_column_each():
+    (known,) = multisine_campaign(resonance, realisations=1, input_noise=0.1).records
+    item = known.harmonics["force"]
+    found = _run_errors._harmonic_changes(item, known.frequency, (0,), known.phase)
+    assert found.shape[1] == 2 * item.orders.size - (0 in item.orders)
+    first = item.orders[1 if 0 in item.orders else 0]
+    sd = np.sqrt(item.variances[list(item.orders).index(first)])
+    np.testing.assert_allclose(
+        found[0, 1 if 0 in item.orders else 0], sd * np.cos(2 * np.pi * first * known.phase),
+        atol=1e-12,
+    )  # fmt: skip

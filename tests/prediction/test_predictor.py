@@ -40,7 +40,7 @@ def records(**options):
 def test_by_run_parameters_have_a_place_for_every_run():
     layout = Layout.of(force_law(), ["one", "two", "three"])
     assert layout.names == ("c", "offset[one]", "offset[two]", "offset[three]", "k")
-    assert layout.active == ("c", "offset", "k")
+    assert layout.active == (("c", "offset", "k"),) * 3
     np.testing.assert_array_equal(layout.columns, [[0, 1, 4], [0, 2, 4], [0, 3, 4]])
     np.testing.assert_array_equal(layout.start(force_law()), [2.0, 0.5, 0.5, 0.5, 3.0])
     assert [prior.mean for prior in layout.priors(force_law())] == [2.0, 0.5, 0.5, 0.5, 3.0]

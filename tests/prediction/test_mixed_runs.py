@@ -1,0 +1,137 @@
+"""Periodic runs and transients of one model: each depends on what it has, and a cycle has no start.
+
+An oscillator is simulated by SciPy: twice in its cycle under a sinusoidal force, twice as it swings
+out freely.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from bayesoleo.data import CampaignData, Channel, Run, reduce_campaign
+from bayesoleo.discovery._assembly import Assembly, assign
+from bayesoleo.discovery._fit import Numerics, fit_model
+from bayesoleo.discovery._state import fit_state
+from bayesoleo.model import Dof, Model, Output, Parameter
+from bayesoleo.model._drive_and_start import start_parameters
+from bayesoleo.prediction._predictor import Layout, Predictor
+
+DAMPING, STIFFNESS, NOISE = 0.8, 90.0, 1e-4
+TIME = 0.01 * np.arange(1000)
+
+
+def oscillator(**starts: str) -> Model:
+    parameters = {
+        "damping": Parameter(1.0, "1/s", relative_sd=0.5),
+        "stiffness": Parameter(80.0, "1/s**2", relative_sd=0.5),
+        "begin": Parameter(0.1, "m", sd=1.0),
+    }
+    if not starts:
+        del parameters["begin"]
+    return Model(
+        "oscillator",
+        dofs={"x": Dof("m", **starts)},
+        inputs={"pull": "m/s**2"},
+        parameters=parameters,
+        equations={"x": "ddot(x) + damping*dot(x) + stiffness*x - pull"},
+        outputs={"position": Output("x", "m")},
+    )
+
+
+def swings(label: str, kind: str, role: str, rng: np.random.Generator) -> Run:
+    frequency = 1.0 if kind == "periodic" else None
+    size = 5.0 if kind == "periodic" else 0.0
+
+    def pull(t):
+        return size * np.sin(2 * np.pi * t)
+
+    span = (-40.0 if frequency else 0.0, TIME[-1])
+    found = solve_ivp(
+        lambda t, s: [s[1], pull(t) - DAMPING * s[1] - STIFFNESS * s[0]],
+        span, [0.1, 0.0], rtol=1e-10, atol=1e-12, t_eval=TIME,
+    )  # fmt: skip
+    position = found.y[0] + NOISE * rng.standard_normal(TIME.size)
+    return Run(
+        label, f"{label}.csv", label, role, kind, frequency, TIME,
+        {"pull": pull(TIME), "position": position},
+    )  # fmt: skip
+
+
+def mixed(**roles: str):
+    """Runs by kind and role, such as ``cycle="fit"``."""
+    rng = np.random.default_rng(5)
+    kinds = {"cycle": "periodic", "slow": "periodic", "free": "transient", "last": "transient"}
+    runs = tuple(swings(label, kinds[label], role, rng) for label, role in roles.items())
+    channels = {
+        "pull": Channel(name="pull", column="pull", unit="m/s**2", si_unit="m/s**2"),
+        "position": Channel(name="position", column="position", unit="m", si_unit="m"),
+    }
+    made = CampaignData("mixed", "", "pull", ".", channels, runs, "")
+    return reduce_campaign(made, jobs=1)
+
+
+@pytest.fixture(scope="module")
+def campaign():
+    return mixed(cycle="fit", free="fit", slow="hold-out", last="hold-out")
+
+
+def test_a_start_belongs_to_transients_alone(campaign):
+    model = Assembly(oscillator(), "pull", starts=True).model()
+    predictor = Predictor(model, campaign.records[:2], steps=64, backend="numpy", jobs=1)
+    assert predictor.layout.names == (
+        "damping", "stiffness", "start_x[free]", "start_rate_x[free]"
+    )  # fmt: skip
+    theta = np.array([DAMPING, STIFFNESS, 0.0, 0.0])
+    cycle, free = predictor.evaluate(theta)
+    assert cycle.status.ok
+    assert free.status.ok
+    assert not cycle.sensitivity[:, 2:].any()
+    assert free.sensitivity[:, 2:].any(axis=(0, 2)).all()
+    # As a campaign of periodic runs alone predicts it.
+    alone = Predictor(oscillator(), campaign.records[:1], steps=64, backend="numpy", jobs=1)
+    (same,) = alone.evaluate(theta[:2])
+    np.testing.assert_array_equal(same.y, cycle.y)
+    np.testing.assert_array_equal(same.sensitivity, cycle.sensitivity[:, :2])
+
+
+def test_what_a_start_depends_on_is_told_from_what_moves():
+    assert start_parameters(oscillator(initial="begin")) == {"begin"}
+    assert start_parameters(oscillator(initial="begin*stiffness/80")) == {"begin"}
+    assert start_parameters(oscillator(initial="0")) == frozenset()
+    assert start_parameters(oscillator()) == frozenset()
+
+
+def test_a_declared_start_common_to_all_runs_is_an_unknown_of_transients():
+    layout = Layout.of(oscillator(initial="begin"), ["cycle", "free"], [True, False])
+    assert layout.names == ("damping", "stiffness", "begin")
+    assert [own.tolist() for own in layout.columns] == [[0, 1], [0, 1, 2]]
+
+
+def test_both_kinds_together_are_estimated_without_false_unknowns(campaign):
+    model = Assembly(oscillator(), "pull", starts=True).model()
+    fit = fit_model(model, campaign.records[:2], Numerics(jobs=1, backend="numpy"))
+    assert fit.point.status.ok
+    assert set(fit.values) == {"damping", "stiffness", "start_x[free]", "start_rate_x[free]"}
+    away = (fit.point.theta[:2] - [DAMPING, STIFFNESS]) / fit.point.sd[:2]
+    assert np.abs(away).max() < 4.0
+
+
+@pytest.mark.parametrize(
+    "roles",
+    [
+        {"cycle": "fit", "slow": "fit", "free": "hold-out"},
+        {"free": "fit", "last": "fit", "cycle": "hold-out"},
+    ],
+    ids=["cycles are fitted", "transients are fitted"],
+)
+def test_one_kind_predicts_the_other(roles):
+    """What the fitted runs lack is the prediction's own."""
+    reduced = mixed(**roles)
+    assembly = Assembly(oscillator(), "pull", starts=True)
+    state = fit_state(assembly, assign(reduced.records), Numerics(jobs=1, backend="numpy"))
+    fitted = [label for label, role in roles.items() if role == "fit"]
+    own = [name for name in state.fit.values if "[" in name]
+    assert {name.split("[")[1][:-1] for name in own} == set(fitted) - {"cycle", "slow"}
+    assert state.at_floor
