@@ -41,6 +41,7 @@ from bayesoleo.estimation._baselines import (
 from bayesoleo.estimation._nuisance import uncertain_conditions
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._input_bandwidth import without_invented
+from bayesoleo.prediction._mesh_steps import MOST_STEPS, first_steps
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
 from bayesoleo.solvers._orbit import Status, count, counted
@@ -97,7 +98,7 @@ def predict(
     seed: int = 0,
     scheme: str = DEFAULT_SCHEME,
     solver: str = COLLOCATION,
-    steps: int = STEPS,
+    steps: int | None = None,
     jobs: int | None = None,
     common_offset: bool = False,
 ) -> LabelledResult:
@@ -119,8 +120,10 @@ def predict(
     level : float, optional
         Of the intervals.
     seed : int, optional
-    scheme, solver, steps
+    scheme, solver
         How runs are solved.
+    steps : int, optional
+        Of a period; by default as many as its inputs ask for.
     jobs : int, optional
         Threads.
     common_offset : bool, optional
@@ -250,9 +253,12 @@ def _one_run(
     level: float,
     scheme: str,
     solver: str,
-    steps: int,
+    steps: int | None,
     jobs: int | None,
 ) -> _Run:
+    if steps is None:
+        wanted = 2 * first_steps(model, [record]) if record.periodic else STEPS
+        steps = min(max(STEPS, wanted), MOST_STEPS)
     predictor = Predictor(model, [record], steps=steps, scheme=scheme, solver=solver, jobs=jobs)
     names, priors = predictor.layout.names, predictor.layout.priors(model)
     number = len(next(iter(known.sd.values())))

@@ -38,7 +38,7 @@ from bayesoleo.data._frequency_response import (
 )
 from bayesoleo.data._reduction import ReducedCampaign, reduce_campaign
 from bayesoleo.discovery._assembly import Assembly, Roles, assign
-from bayesoleo.discovery._fit import ModelFit, first_steps
+from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.errors import CampaignError, DataWarning, InputError, ModelError
 from bayesoleo.estimation._nuisance import declared_nuisance
 from bayesoleo.model._derivatives import derive
@@ -46,6 +46,7 @@ from bayesoleo.model._dimensions import check_dimensions
 from bayesoleo.model._drive_and_start import driven_by, possible_drives
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._input_bandwidth import Invented, Lost, lost_inputs, without_invented
+from bayesoleo.prediction._mesh_steps import first_steps
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
 from bayesoleo.solvers._collocation import linear

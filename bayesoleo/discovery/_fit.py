@@ -29,11 +29,20 @@ from bayesoleo.estimation._estimate import estimate, polish
 from bayesoleo.estimation._least_squares import PriorScale
 from bayesoleo.estimation._point_estimate import PointEstimate
 from bayesoleo.model._model import Model
+from bayesoleo.prediction._mesh_steps import (
+    COARSEST,
+    MOST_COMPARED,
+    MOST_STEPS,
+    WHOLE,
+    fineness,
+    first_steps,
+    steps_for,
+)
 from bayesoleo.prediction._predictor import Predictor, RunPrediction
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._run_errors import motion_error, outputs_of
 from bayesoleo.prediction._stability import Stability
-from bayesoleo.prediction._transient_run import COARSEST, SETTLED, WHOLE
+from bayesoleo.prediction._transient_run import SETTLED
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._schemes import COLLOCATION, DEFAULT_SCHEME
 
@@ -56,11 +65,6 @@ RESOLVED = 1e-3
 #: An estimate ends where the optimum is nearer than this many posterior standard deviations; its
 #: iterations gain a digit each, and what is below no figure shows.
 RESOLUTION = 1e-3
-#: Steps for each harmonic of the inputs, and limits.
-STEPS_PER_HARMONIC = 4
-FEWEST_STEPS, MOST_STEPS = 128, 8192
-#: Steps up to which a mesh is refined of a model that is only compared with others.
-MOST_COMPARED = 16 * WHOLE
 
 
 def weights(record: Record) -> Array:
@@ -281,6 +285,15 @@ class ModelFit:
         return self.predictor.records
 
     @property
+    def fineness(self) -> int:
+        """How finely transients are cut on this mesh."""
+        return fineness(self.model, self.records, self.steps)
+
+    def steps_for(self, records: Sequence[Record]) -> int:
+        """Steps of other runs on a mesh as fine as this one."""
+        return steps_for(self.model, self.records, self.steps, records)
+
+    @property
     def all_periodic(self) -> bool:
         """Whether no fitted run is a transient."""
         return all(record.periodic for record in self.records)
@@ -305,21 +318,6 @@ class ModelFit:
     def shared(self) -> dict[str, float]:
         """Estimates of the parameters that all runs have in common."""
         return {name: value for name, value in self.values.items() if name in self.model.parameters}
-
-
-def first_steps(model: Model, records: Sequence[Record]) -> int:
-    """Steps to start from: a few for each significant harmonic of the inputs, a power of two."""
-    highest = max(
-        (
-            int(record.harmonics[name].orders[-1])
-            for record in records
-            for name in model.inputs
-            if name in record.harmonics
-        ),
-        default=1,
-    )
-    wanted = max(FEWEST_STEPS, STEPS_PER_HARMONIC * highest)
-    return int(min(MOST_STEPS, 2 ** int(np.ceil(np.log2(wanted)))))
 
 
 def fit_model(

@@ -424,7 +424,7 @@ def _on_halves(
     before: State, after: State, halves: Roles, numerics: Numerics
 ) -> tuple[State, State]:
     """Both models estimated on the first half of each fitted run and compared on the second."""
-    quick = replace(numerics, steps=after.fit.steps)
+    quick = replace(numerics, steps=after.fit.steps_for(halves.fitted))
     old, new = (
         fit_state(state.assembly, halves, quick, start=state.fit.point.theta)
         for state in (before, after)

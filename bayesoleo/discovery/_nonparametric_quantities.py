@@ -396,5 +396,5 @@ def _run(
     if isinstance(present, TransientRun):
         like = copy(present)
         like.known_rows = rows
-        return TransientRun(model, compiled, record, fit.steps, scheme, like)
+        return TransientRun(model, compiled, record, fit.fineness, scheme, like)
     return RunPredictor(model, compiled, record, fit.steps, scheme, rows)

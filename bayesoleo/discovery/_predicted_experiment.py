@@ -591,7 +591,7 @@ def _solved(
     """A run's prediction: from the motion of the run that it varies, or else from its start."""
     # Steps that did for the fit of long transients do for their variations.
     long = any(run.can_be_coarser for run in fit.predictor.runs) and not record.periodic
-    steps = min(STEPS, fit.steps) if long else STEPS
+    steps = min(STEPS, fit.fineness) if long else STEPS
     predictor = Predictor(
         known.model, [record], steps=steps, scheme=fit.numerics.scheme, backend="numpy", jobs=1
     )

@@ -264,7 +264,8 @@ def place_of(
     fitted = replace(roles, held_out=(), strategy="none")
     # What the priors hardly allow was looked at when the effect was added: no draws from them.
     start = start_from(final.fit, final.fit.values, less.model())
-    without = fit_state(less, fitted, replace(numerics, steps=final.fit.steps), start=start)
+    quick = replace(numerics, steps=final.fit.steps_for(fitted.fitted))
+    without = fit_state(less, fitted, quick, start=start)
     if not all(np.isfinite(run.y).all() for run in without.fit.predictions):
         return None  # a run has no solution there, and nothing can be scored
     base = without.base()

@@ -24,7 +24,6 @@ from bayesoleo._types import Array, Float
 from bayesoleo.data._noise import innovation_noise
 from bayesoleo.discovery._assembly import RecordNoise, halves
 from bayesoleo.discovery._fit import (
-    MOST_COMPARED,
     RESOLUTION,
     ModelFit,
     changed_squares,
@@ -34,9 +33,9 @@ from bayesoleo.discovery._fit import (
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._estimate import estimate
+from bayesoleo.prediction._mesh_steps import MOST_COMPARED, WHOLE
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
-from bayesoleo.prediction._transient_run import WHOLE
 from bayesoleo.solvers._orbit import Status
 
 #: Columns whose overlap says how many independent coefficients a band holds.
@@ -201,7 +200,7 @@ def _single(
     return Predictor(
         fit.model,
         [record],
-        steps=steps or fit.steps,
+        steps=steps or fit.steps_for([record]),
         scheme=numerics.scheme,
         solver=numerics.solver,
         backend=numerics.backend,
@@ -211,12 +210,14 @@ def _single(
 
 
 def _held_out(fit: ModelFit, record: Record) -> Prediction:
-    """On the mesh of the fit, or a finer one where a long transient asks for it."""
+    """On the mesh of the fit, or a finer one where a long transient asks for it, or a run that
+    repeats after a fit to transients, which says nothing of its steps."""
     predictor = _single(fit, record)
+    other_kind = record.periodic and not any(known.periodic for known in fit.records)
     while True:
         found, steps = _estimated_on(fit, record, predictor), predictor.steps
         run = predictor.runs[0]
-        if not run.can_be_coarser or steps >= MOST_COMPARED:
+        if not (run.can_be_coarser or other_kind) or steps >= MOST_COMPARED:
             return found
         finer = _single(fit, record, 2 * steps, predictor)
         if found.status.ok:

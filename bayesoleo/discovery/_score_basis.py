@@ -27,11 +27,11 @@ from bayesoleo.discovery._spectral_data import SpectralData
 from bayesoleo.estimation._least_squares import PriorScale
 from bayesoleo.estimation._problem import measured_of
 from bayesoleo.model._model import Model
+from bayesoleo.prediction._mesh_steps import WHOLE
 from bayesoleo.prediction._periodic_run import PredictedSamples, RunPredictor
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._run_errors import input_columns
-from bayesoleo.prediction._transient_run import WHOLE
 from bayesoleo.solvers._orbit import Status
 
 #: A squared residual norm below this part of the squared norm is no direction of its own: the

@@ -31,6 +31,7 @@ from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._run_predictions import Prediction, predict_fitted, predict_held_out
 from bayesoleo.discovery._score_basis import Base, base_of
 from bayesoleo.model._model import Model
+from bayesoleo.prediction._mesh_steps import steps_for
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._stability import Stability
 
@@ -202,8 +203,9 @@ def _compared(
 
 def _left_out(fit: ModelFit, roles: Roles) -> list[Prediction]:
     """Each run predicted by a fit to all the others, from the joint estimate."""
-    numerics = replace(fit.numerics, steps=fit.steps, scheduler=None)
-    left_out = _LeftOut(fit.model, fit.records, numerics, fit.problem.names, fit.point.theta)
+    numerics = replace(fit.numerics, scheduler=None)
+    names = fit.problem.names
+    left_out = _LeftOut(fit.model, fit.records, numerics, fit.steps, names, fit.point.theta)
     with connected(fit.numerics.scheduler) as client:
         # Each local fit uses all threads.
         found = dict(each_done(left_out, roles.held_out, client=client, jobs=1))
@@ -217,13 +219,16 @@ class _LeftOut:
     model: Model
     records: tuple[Record, ...]
     numerics: Numerics
+    steps: int
     names: tuple[str, ...]
     theta: np.ndarray
 
     def __call__(self, record: Record) -> Prediction:
         others = [other for other in self.records if other.label != record.label]
         keep = [k for k, name in enumerate(self.names) if not name.endswith(f"[{record.label}]")]
-        partial = fit_model(self.model, others, self.numerics, start=self.theta[keep])
+        steps = steps_for(self.model, self.records, self.steps, others)
+        numerics = replace(self.numerics, steps=steps)
+        partial = fit_model(self.model, others, numerics, start=self.theta[keep])
         return predict_held_out(partial, [record])[0]
 
 

@@ -18,6 +18,7 @@ from bayesoleo.model._drive_and_start import start_parameters
 from bayesoleo.model._kernels import kernels
 from bayesoleo.model._model import Model
 from bayesoleo.model._priors import Prior
+from bayesoleo.prediction._mesh_steps import fineness
 from bayesoleo.prediction._periodic_run import PredictedSamples, RunPredictor
 from bayesoleo.prediction._periodic_solver import SolvedRun
 from bayesoleo.prediction._records import Record
@@ -150,7 +151,8 @@ class Predictor:
     records : sequence of Record
         The runs.
     steps : int
-        Steps of the mesh in a period; how finely the steps of transients are cut.
+        Steps of the mesh in a period. Where all runs are transients, how finely their steps are
+        cut; beside periodic runs that follows from how much more these take than their first.
     scheme : str
         Discretisation: ``radau2``, ``radau3``, ``gauss2``, ``gauss3`` or ``thesis``.
     solver : str
@@ -184,6 +186,8 @@ class Predictor:
             jobs,
         )
         self.backend, self.solver = backend, solver
+        #: How finely transients are cut, also beside periodic runs of other steps.
+        self.fineness = fineness(model, self.records, steps)
         self.layout = Layout.of_records(model, records)
         compiled = {own: kernels(model, own, backend) for own in dict.fromkeys(self.layout.active)}
         self.outputs = tuple(model.outputs)
@@ -198,7 +202,7 @@ class Predictor:
                     return RunPredictor(model, own, record, steps, scheme, rows)
                 return SolvedRun(model, own, record, steps, scheme, solver, backend, rows)
             same = like if isinstance(like, TransientRun) else None
-            return TransientRun(model, own, record, steps, scheme, same)
+            return TransientRun(model, own, record, self.fineness, scheme, same)
 
         self.runs: list[RunPredictor] = thread_map(
             build, list(zip(self.records, self.layout.active, strict=True)), jobs

@@ -20,6 +20,7 @@ from bayesoleo.prediction._inputs import (
     signal_of,
     signal_of_transient,
 )
+from bayesoleo.prediction._mesh_steps import WHOLE
 from bayesoleo.prediction._periodic_run import PredictedSamples, RunPredictor
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._starts import Anchor, InitialState, Motion
@@ -36,11 +37,6 @@ from bayesoleo.solvers._transient import (
     transient_sensitivities,
 )
 
-#: Steps in a period at which a transient's mesh is the integrator's own; twice as many halve each,
-#: and fewer join the equal steps of a long record.
-WHOLE = 128
-#: The fewest: at most three of a highest frequency's radians in a step, which still sees all of it.
-COARSEST = WHOLE // 4
 #: To follow the inputs, steps are shortened to this many samples and to this angle at the highest
 #: frequency of an input at most, which a method of fifth order follows to 1e-4.
 SAMPLES_A_STEP, ANGLE = 4, 0.75

@@ -23,10 +23,11 @@ import numpy as np
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import prepare, reduce
 from bayesoleo.data import dataset_folder
-from bayesoleo.discovery._fit import RESOLUTION, first_steps
+from bayesoleo.discovery._fit import RESOLUTION
 from bayesoleo.estimation import FunctionProblem, estimate, estimate_many, polish
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.model._priors import Normal
+from bayesoleo.prediction._mesh_steps import first_steps
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.systems import system
 

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from bayesoleo import system
-from bayesoleo.discovery._fit import FEWEST_STEPS, Numerics, first_steps, fit_model
+from bayesoleo.discovery._fit import Numerics, fit_model
 from bayesoleo.discovery._loop import _limit, _warnings
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._result_tree import point_group
 from bayesoleo.model import Model, Parameter
+from bayesoleo.prediction._mesh_steps import FEWEST_STEPS, first_steps
 from bayesoleo.prediction._simulate import RunPlan, motion, record_of, simulate_run
 
 MODEL = system("duffing")

@@ -18,9 +18,10 @@ from bayesoleo.discovery._fit import (
 from bayesoleo.discovery._run_predictions import predict_held_out
 from bayesoleo.discovery._score_basis import sensitivities_of
 from bayesoleo.model import Dof, Model, Output, Parameter
+from bayesoleo.prediction._mesh_steps import COARSEST, WHOLE
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import transient_record
-from bayesoleo.prediction._transient_run import COARSEST, WHOLE, TransientRun
+from bayesoleo.prediction._transient_run import TransientRun
 from bayesoleo.solvers._orbit import Status
 
 STEP, COUNT = 1.0 / 600.0, 6000

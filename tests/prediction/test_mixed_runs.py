@@ -16,6 +16,7 @@ from bayesoleo.discovery._fit import Numerics, fit_model
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.model import Dof, Model, Output, Parameter
 from bayesoleo.model._drive_and_start import start_parameters
+from bayesoleo.prediction._mesh_steps import steps_for
 from bayesoleo.prediction._predictor import Layout, Predictor
 
 DAMPING, STIFFNESS, NOISE = 0.8, 90.0, 1e-4
@@ -135,3 +136,68 @@ def test_one_kind_predicts_the_other(roles):
     own = [name for name in state.fit.values if "[" in name]
     assert {name.split("[")[1][:-1] for name in own} == set(fitted) - {"cycle", "slow"}
     assert state.at_floor
+
+
+def broad(label: str, role: str) -> Run:
+    """A cycle of 1 000 samples with 300 lines."""
+    rng = np.random.default_rng(len(label))
+    order, lines = np.arange(501), np.zeros(501, dtype=complex)
+    lines[1:301] = np.exp(2j * np.pi * rng.random(300))
+    pull = np.tile(100.0 * np.fft.irfft(lines, 1000), 2)
+    turn = 2j * np.pi * order * 0.1
+    answer = np.fft.irfft(np.fft.rfft(pull[:1000]) / (turn**2 + DAMPING * turn + STIFFNESS), 1000)
+    time = 0.01 * np.arange(2000)
+    samples = {
+        "pull": pull + 1e-3 * rng.standard_normal(2000),
+        "position": np.tile(answer, 2) + NOISE * rng.standard_normal(2000),
+    }
+    return Run(label, f"{label}.csv", label, role, "periodic", 0.1, time, samples)
+
+
+def test_the_steps_of_a_broadband_cycle_are_none_of_a_transient():
+    """2 048 steps a cycle would cut those of a transient into sixteen each."""
+    rng = np.random.default_rng(5)
+    runs = (
+        broad("broad", "fit"),
+        swings("free", "transient", "fit", rng),
+        swings("last", "transient", "hold-out", rng),
+    )
+    made = CampaignData("mixed", "", "pull", ".", mixed(free="fit").campaign.channels, runs, "")
+    reduced = reduce_campaign(made, jobs=1)
+    assembly = Assembly(oscillator(), "pull", starts=True)
+    numerics = Numerics(jobs=1, backend="numpy")
+    state = fit_state(assembly, assign(reduced.records), numerics)
+    assert state.fit.steps >= 1024
+    assert state.fit.fineness < state.fit.steps / 4
+    (last,) = state.held_out
+    assert last.predictor.fineness == state.fit.fineness
+    assert state.at_floor
+
+
+def test_a_cycle_is_solved_on_steps_of_its_own_after_a_fit_to_transients():
+    rng = np.random.default_rng(5)
+    runs = (swings("free", "transient", "fit", rng), broad("broad", "hold-out"))
+    made = CampaignData("mixed", "", "pull", ".", mixed(free="fit").campaign.channels, runs, "")
+    reduced = reduce_campaign(made, jobs=1)
+    assembly = Assembly(oscillator(), "pull", starts=True)
+    state = fit_state(assembly, assign(reduced.records), Numerics(jobs=1, backend="numpy"))
+    (cycle,) = state.held_out
+    assert state.fit.fineness < 1024 <= cycle.predictor.steps
+    assert state.at_floor
+
+
+@pytest.mark.parametrize(
+    ("fitted", "steps", "others", "expected"),
+    [
+        ("cycle", 512, "free", 512),  # four times its first steps: a quarter of each
+        ("free", 32, "cycle", 128),
+        ("free", 256, "cycle", 256),
+        ("cycle free", 256, "free", 256),
+        ("cycle free", 256, "slow", 256),
+    ],
+)
+def test_steps_of_other_runs(fitted, steps, others, expected):
+    records = {r.label: r for r in mixed(cycle="fit", slow="fit", free="fit").records}
+    known = [records[label] for label in fitted.split()]
+    asked = [records[label] for label in others.split()]
+    assert steps_for(oscillator(), known, steps, asked) == expected
