@@ -272,7 +272,13 @@ def _unexplained(summary: Mapping[str, Any]) -> str:
     if any(c.get("estimated") for c in last["candidates"]):
         return f"; no further effect was confirmed, the nearest is {nearest}"
     share = f"{100 * best['gain']:.0f} %"
-    return f"; {nearest} would explain {share} of the excess, and was not tried"
+    earlier = any(
+        (c["effect"], c["target"]) == (best["effect"], best["target"]) and c.get("estimated")
+        for one in summary["rounds"]
+        for c in one["candidates"]
+    )
+    tried = "was tried in an earlier round alone" if earlier else "was not tried"
+    return f"; {nearest} would explain {share} of the excess, and {tried}"
 
 
 def tiles(

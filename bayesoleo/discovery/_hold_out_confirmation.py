@@ -27,6 +27,7 @@ from bayesoleo.discovery._refit import Refit, noise_of_fit
 from bayesoleo.discovery._run_predictions import Prediction, crossed
 from bayesoleo.discovery._state import State, fit_state
 from bayesoleo.discovery._transient_variance import coloured_variance, noise_along
+from bayesoleo.prediction._inputs import lacking
 from bayesoleo.prediction._run_errors import input_columns
 
 
@@ -358,6 +359,9 @@ def confirmed(
             None,
             f"the posterior of {item.effect} does not exclude its null: {_on_fitted(result)}",
         )
+    reason = lacking(result.assembly.model().inputs, roles.held_out)
+    if reason is not None:
+        return None, f"{item.effect} cannot be confirmed: {reason}"
     callback(f"confirm {item.effect} on hold-out runs")
     after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
     if not after.hold_errors.entries:

@@ -23,11 +23,11 @@ from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._alternatives import best_of_beam, eliminated
 from bayesoleo.discovery._assembly import Added, Assembly, Roles
 from bayesoleo.discovery._fit import ModelFit, Numerics
-from bayesoleo.discovery._fit_and_hold_out_error import least_noise
+from bayesoleo.discovery._fit_and_hold_out_error import least_noise, limit
 from bayesoleo.discovery._judged_together import TOGETHER, judged_together
 from bayesoleo.discovery._nonparametric_round import nonparametric_notes, with_nonparametric
 from bayesoleo.discovery._policy import SearchPolicy
-from bayesoleo.discovery._ranking import ABSORBING_FAMILIES
+from bayesoleo.discovery._ranking import ABSORBING_FAMILIES, Ranked
 from bayesoleo.discovery._review import reviewed
 from bayesoleo.discovery._round import JUDGED, Progress, Round, examine
 from bayesoleo.discovery._scanned_columns import Scanned
@@ -210,9 +210,11 @@ class ClosedLoop:
 
         The effect must explain everything alone: the errors are at the noise floor and no other
         effect is significant. The data must distinguish it from all other effects of the catalogue.
-        It must be so large that a merely similar effect would have left a significant remainder.
-        Hold-out runs must have confirmed it. Where the probabilities of structures are known, its
-        own must be 0.95 at least.
+        It must be so large that a merely similar effect would have left a significant remainder,
+        and none of its family may leave only noise too: laws of one family differ by conventions,
+        such as how a friction turns about, and a small difference of the likelihood shows no more.
+        Hold-out runs must have confirmed it, and without it be beyond what chance allows. Where the
+        probabilities of structures are known, its own must be 0.95 at least.
         """
         if not self.complete or self.final.too_quiet or not self.final.hold_errors.entries:
             return False
@@ -228,12 +230,42 @@ class ClosedLoop:
             return False
         if found.score.option.candidate.family == FAMILY:
             return False  # a nonparametric function names no effect
+        if self._has_sibling(found) or not self._shown_by_hold_out:
+            return False
         level, same = self.policy.significance, self.policy.same_cosine
         if any(item.p_value < level for item in last.ranking):
             return False
         local = -np.expm1(np.log1p(-level) / last.tests)
         fall = estimate.fall / estimate.inflation
         return bool((1.0 - same) * fall > stats.chi2.isf(local, 1))
+
+    def _has_sibling(self, found: Ranked) -> bool:
+        """Whether another effect of the same family and place leaves only noise too."""
+        own = found.score.option
+        return any(
+            item.refit is not None
+            and item.refit.reached
+            and item.score.option.key != own.key
+            and item.score.option.key[1] == own.key[1]
+            and item.score.option.candidate.family == own.candidate.family
+            for entry in self.rounds
+            if entry.accepted is not None and entry.accepted.score.option.key == own.key
+            for item in entry.ranking
+        )
+
+    @property
+    def _shown_by_hold_out(self) -> bool:
+        """Whether the error of the declared model in a hold-out run is beyond what chance allows
+        now. Where the parameters are so little known there that it is not, the run tests nothing.
+        """
+        final = self.final.hold_errors
+        return any(
+            not before.repeating
+            <= limit([after], len(final.entries), policy=self.policy) * after.expected_error
+            for before in self.first.hold_errors.entries
+            for after in [final.at(before.output, before.run)]
+            if after.expected_error is not None
+        )
 
 
 @single_blas_thread()  # matrices are small: threads take longer to meet than to work

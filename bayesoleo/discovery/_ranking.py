@@ -37,6 +37,7 @@ from bayesoleo.discovery._score_tests import (
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._parts import Scales
 from bayesoleo.effects._places import BETWEEN
+from bayesoleo.prediction._inputs import lacking
 from bayesoleo.prediction._records import Record
 
 #: Lines on either side whose median is the level beside a line; cycles over the record below which
@@ -307,6 +308,13 @@ def score_candidates(
     """
     scales = scales_of(base.fit, assembly.drive, tuple(assembly.native.dofs))
     options = assembly.options(scales, None if effects is None else tuple(effects))
+    reasons = [lacking(option.model.inputs, base.fit.records) for option in options]
+    without = {
+        " at ".join(option.key): reason
+        for option, reason in zip(options, reasons, strict=True)
+        if reason is not None
+    }
+    options = [one for one, reason in zip(options, reasons, strict=True) if reason is None]
     callback(f"score {len(options)} candidates")
     if keep is not None and size_of(base.fit, options) <= MOST_KEPT:
         scores, failed, columns = score_and_keep(base, options, jobs)
@@ -319,7 +327,7 @@ def score_candidates(
     kept, twins = without_twins(scores, policy=base.policy)
     if order is None:
         kept.sort(key=lambda score: -score.share)
-    return kept, failed | twins
+    return kept, without | failed | twins
 
 
 def rank(

@@ -11,7 +11,7 @@ propagated noise, band by band. The noise is the same for all models.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -214,8 +214,9 @@ def _held_out(fit: ModelFit, record: Record) -> Prediction:
     repeats after a fit to transients, which says nothing of its steps."""
     predictor = _single(fit, record)
     other_kind = record.periodic and not any(known.periodic for known in fit.records)
+    known: Mapping[str, float] = {}
     while True:
-        found, steps = _estimated_on(fit, record, predictor), predictor.steps
+        found, steps = _estimated_on(fit, record, predictor, known), predictor.steps
         run = predictor.runs[0]
         if not (run.can_be_coarser or other_kind) or steps >= MOST_COMPARED:
             return found
@@ -234,16 +235,21 @@ def _held_out(fit: ModelFit, record: Record) -> Prediction:
                 return found
         elif steps >= WHOLE:
             return found
-        predictor = finer
+        predictor, known = finer, found.theta if found.status.ok else {}
 
 
-def _estimated_on(fit: ModelFit, record: Record, predictor: Predictor) -> Prediction:
-    """Prediction of a run, its own unknowns estimated on it."""
+def _estimated_on(
+    fit: ModelFit, record: Record, predictor: Predictor, known: Mapping[str, float]
+) -> Prediction:
+    """Prediction of a run, its own unknowns estimated on it, from where they are known."""
     problem = CampaignProblem(predictor).holding(fit.shared)
     own = len(problem.names)
     # What is known of a nuisance parameter counts; of any other, only what the run says.
     method = "be" if problem.nuisances.intersection(problem.names) else "mbe"
-    theta = estimate(problem, method, resolution=RESOLUTION).theta if own else np.empty(0)
+    start = np.array([known[name] for name in problem.names]) if known else None
+    theta = np.empty(0)
+    if own:
+        theta = estimate(problem, method, start=start, resolution=RESOLUTION).theta
     full = problem.full(theta[None])[0]
     status = predictor.set_anchor(full)[0]
     samples = predictor.simulate(full[None], 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from weakref import WeakKeyDictionary
 
@@ -75,6 +75,22 @@ def signal_of(record: Record, channel: str, highest: int = 0) -> Signal:
             hint=f"channels there are: {', '.join(record.signals) or 'none'}",
         )
     return record.signals[channel].for_derivative(highest)
+
+
+def lacking(inputs: Iterable[str], records: Iterable[Record]) -> str | None:
+    """Why a model with these inputs has no solution in some run; None where all runs have them.
+
+    The phase of a channel is that of its first harmonic, which a multisine may not have.
+    """
+    for record in records:
+        for name in inputs:
+            if name in record.signals or _restricted(record, name) is not None:
+                continue
+            part, _, other = name.partition(WITHIN)
+            if part in (COSINE, SINE) and other in record.harmonics:
+                return f"run {record.label}: {other} has no first harmonic, whose phase it needs"
+            return f"run {record.label} has no channel {name!r}"
+    return None
 
 
 def highest_derivatives(rows: tuple[tuple[str, int], ...]) -> dict[str, int]:

@@ -23,7 +23,7 @@ from small_campaigns import (
 from bayesoleo.data import SimulatedRun, load_campaign, reduce_campaign, write_campaign
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._loop import close_loop
-from bayesoleo.discovery._ranking import line_of, scales_of
+from bayesoleo.discovery._ranking import line_of, scales_of, score_candidates
 from bayesoleo.discovery._score_tests import score_all
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.discovery._summary import summarise
@@ -243,3 +243,33 @@ def test_an_equation_in_time_is_refused_of_a_periodic_run_by_name(tmp_path):
     reduced = oscillator_campaign(tmp_path, restoring=lambda x, v: 100 * x + v)
     with pytest.raises(ModelError, match=r"depends on time.*run a is periodic"):
         fitted(reduced, model)
+
+
+@pytest.mark.parametrize("bare", ["fitted", "held out"])
+def test_a_drive_without_its_first_harmonic_gives_no_phase(hum, bare):
+    """A multisine seldom has one. The others of the catalogue are looked at all the same."""
+
+    def without_first(record):
+        item = record.harmonics["displacement"]
+        kept = item.orders != 1
+        names = ("orders", "coefficients", "variances")
+        parts = {name: getattr(item, name)[kept] for name in names}
+        return replace(
+            record, harmonics={**record.harmonics, "displacement": replace(item, **parts)}
+        )
+
+    chosen = "fit" if bare == "fitted" else "hold-out"
+    records = tuple(without_first(r) if r.role == chosen else r for r in hum.records)
+    roles = assign(records)
+    base = fit_state(Assembly(damper()), roles, NUMERICS)
+    scores, failed = score_candidates(base.base(), base.assembly, FEW, 1)
+    named = {score.option.candidate.effect for score in scores}
+    assert "coulomb_friction" in named
+    assert ("periodic_force" in named) is (bare == "held out")
+    if bare == "fitted":
+        (reason,) = [text for name, text in failed.items() if name.startswith("periodic_force")]
+        assert reason == "run a: displacement has no first harmonic, whose phase it needs"
+        return
+    loop = close_loop(Assembly(damper()), roles, NUMERICS, effects=FEW[:1], nonparametric=False)
+    assert "periodic_force" not in loop.effects
+    assert "displacement has no first harmonic" in loop.rounds[0].reason

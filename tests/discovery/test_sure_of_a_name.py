@@ -68,23 +68,42 @@ def test_what_a_step_from_the_null_describes_badly_is_estimated_all_the_same():
     assert not _may_be_significant(noise, TESTS, POLICY)
 
 
-def loop(*, fall=2000.0, same=(), floor=True, left=0.5, effects=1, family="contact", held_out=1):
+@pytest.fixture(autouse=True)
+def twice(monkeypatch):
+    """By chance an error is at most twice what is expected."""
+    monkeypatch.setattr(_loop, "limit", lambda entries, tests, *, policy: 2.0)
+
+
+def sibling(*, reached=True, family="contact", target="stroke"):
+    """Another effect as the round ranked it."""
+    option = SimpleNamespace(key=("preload", target), candidate=SimpleNamespace(family=family))
+    return SimpleNamespace(
+        score=SimpleNamespace(option=option), refit=SimpleNamespace(reached=reached)
+    )
+
+
+def loop(
+    *, fall=2000.0, same=(), floor=True, left=0.5, effects=1, family="contact", held_out=1,
+    ranking=(), before=10.0,
+):  # fmt: skip
     """A loop that added effects, the first explaining so much."""
     refit = SimpleNamespace(fall=fall, inflation=1.0)
-    option = SimpleNamespace(candidate=SimpleNamespace(family=family))
+    option = SimpleNamespace(candidate=SimpleNamespace(family=family), key=("play", "stroke"))
     score = SimpleNamespace(option=option)
     accepted = SimpleNamespace(
         effect="play", target="stroke", same=same, refit=refit, beside=None, score=score
     )
     after = SimpleNamespace(accepted=None, ranking=[SimpleNamespace(p_value=left)], tests=TESTS)
-    added = [SimpleNamespace(accepted=accepted, ranking=[], tests=TESTS)] * effects
+    added = [SimpleNamespace(accepted=accepted, ranking=ranking, tests=TESTS)] * effects
+    entry = SimpleNamespace(output="force", run="h", repeating=before, expected_error=1.0)
+    first = SimpleNamespace(hold_errors=SimpleNamespace(entries=[entry] * held_out))
     final = SimpleNamespace(
         at_floor=floor,
         too_quiet=(),
-        hold_errors=SimpleNamespace(entries=[None] * held_out),
+        hold_errors=SimpleNamespace(entries=[entry] * held_out, at=lambda output, run: entry),
         assembly=SimpleNamespace(added=[("play", "stroke")] * effects),
     )
-    return ClosedLoop((*added, after), None, final, None, ())
+    return ClosedLoop((*added, after), first, final, None, ())
 
 
 @pytest.mark.parametrize(
@@ -98,6 +117,14 @@ def loop(*, fall=2000.0, same=(), floor=True, left=0.5, effects=1, family="conta
         ({"effects": 0}, False),
         ({"family": "nonparametric"}, False),
         ({"held_out": 0}, False),
+        ({"ranking": [sibling()]}, False),
+        ({"ranking": [sibling(reached=False)]}, True),
+        ({"ranking": [sibling(family="friction")]}, True),
+        ({"ranking": [sibling(target="other")]}, True),
+        # What the run would have shown without the effect is no more than chance allows with it.
+        ({"before": 1.9}, False),
+        ({"before": 2.1}, True),
+        ({"before": np.nan}, True),
         # One in twenty of it would have to be found if a mere likeness had been named.
         ({"fall": 0.9 * 14.2 / (1 - SAME)}, False),
         ({"fall": 1.1 * 14.2 / (1 - SAME)}, True),

@@ -180,6 +180,20 @@ def test_a_candidate_that_stands_open_is_not_denied(two_runs, estimated, p_value
     assert text in headline(summary).replace("\N{NO-BREAK SPACE}", " ")
 
 
+def test_a_candidate_of_an_earlier_round_was_tried(two_runs):
+    summary = json.loads(two_runs.attrs["summary"])
+    summary.update(verdict=schema.UNEXPLAINED, effects=[])
+    one = {"effect": "cubic", "target": "strut", "gain": 0.3, "p_value": 1e-6, "estimated": False}
+    last = summary["rounds"][-1]
+    earlier = {**last, "candidates": [{**one, "estimated": True}]}
+    summary["rounds"] = [earlier, {**last, "candidates": [one]}]
+    text = headline(summary).replace("\N{NO-BREAK SPACE}", " ")
+    assert (
+        "cubic (strut) would explain 30 % of the excess, and was tried in an earlier round" in text
+    )
+    assert "was not tried" not in text
+
+
 def test_many_candidates_are_folded_and_a_range_stands_for_the_runs(page):
     assert "<details><summary>" in page
     text = expected_text({"gain": 1060.0, "offset[a]": 2.0, "offset[b]": -1.0})
