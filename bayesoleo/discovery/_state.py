@@ -17,7 +17,12 @@ import numpy as np
 from bayesoleo._parallel import connected, each_done, thread_map
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Assembly, Roles
-from bayesoleo.discovery._expected_error import Compared, expected_of_fitted, expected_of_held_out
+from bayesoleo.discovery._expected_error import (
+    Compared,
+    EstimateCovariance,
+    expected_of_fitted,
+    expected_of_held_out,
+)
 from bayesoleo.discovery._fit import ModelFit, Numerics, fit_model, for_comparison, promising
 from bayesoleo.discovery._fit_and_hold_out_error import (
     ErrorTable,
@@ -81,6 +86,9 @@ class State:
         Predictions by run.
     fit_errors, hold_errors : ErrorTable
         Errors of these predictions.
+    known : EstimateCovariance, optional
+        To what the estimates are known by the spectrum of the noise and the noise of measured
+        inputs; where it is not known, the fit's own covariance says it for white noise.
     """
 
     assembly: Assembly
@@ -89,6 +97,16 @@ class State:
     held_out: list[Prediction]
     fit_errors: ErrorTable
     hold_errors: ErrorTable
+    known: EstimateCovariance | None = None
+
+    def sd_of(self, unknown: str) -> float | None:
+        """Standard deviation of an estimate; None for what was not estimated."""
+        names = self.fit.problem.names
+        if unknown not in names:
+            return None
+        if self.known is not None:
+            return float(np.sqrt(self.known.of([unknown])[0, 0]))
+        return float(self.fit.point.sd[names.index(unknown)])
 
     @property
     def policy(self) -> SearchPolicy:
@@ -186,6 +204,7 @@ def state_of(assembly: Assembly, fit: ModelFit, roles: Roles) -> State:
         held_out,
         ErrorTable(tuple(fit_errors)),
         ErrorTable(tuple(entry for row in rows for entry in row)),
+        known.get(""),
     )
 
 

@@ -162,16 +162,8 @@ def _averages(loop: ClosedLoop, found: StructurePosterior) -> dict[str, Any]:
     for name, one in found.parameters.items():
         entries[name] = {"unit": loop.final.assembly.model().parameters[name.split("[")[0]].unit}
         for key, state in states.items():
-            names, point = list(state.fit.problem.names), state.fit.point
-            k = names.index(name) if name in names else None
-            entries[name][key] = (
-                None
-                if k is None
-                else {
-                    "mean": float(point.theta[k]),
-                    "sd": float(np.sqrt(point.covariance[k, k])),
-                }
-            )
+            sd = state.sd_of(name)
+            entries[name][key] = None if sd is None else {"mean": state.fit.values[name], "sd": sd}
         entries[name]["averaged"] = {
             "mean": one.mean,
             "sd": one.sd,

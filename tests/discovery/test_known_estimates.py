@@ -1,0 +1,56 @@
+"""To what the estimates of a search are known: by the noise of outputs and of measured inputs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from multisines import multisine_campaign, resonance
+
+from bayesoleo.discovery._assembly import Assembly, assign
+from bayesoleo.discovery._fit import Numerics
+from bayesoleo.discovery._state import fit_state
+from bayesoleo.model import Dof, Model, Output, Parameter
+
+#: Of the resonator that makes the data: its frequency is the fortieth line of 0.5 Hz.
+TRUE = {"damping": 0.1, "stiffness": 1.0}
+OMEGA = 2 * np.pi * 20.0
+
+
+def resonator() -> Model:
+    return Model(
+        "resonator",
+        dofs={"x": Dof("m")},
+        inputs={"force": "N"},
+        parameters={
+            "damping": Parameter(0.12, "1", relative_sd=0.5),
+            "stiffness": Parameter(1.05, "1", relative_sd=0.5),
+        },
+        equations={"x": f"ddot(x)/{OMEGA}**2 + damping*dot(x)/{OMEGA} + stiffness*x - force"},
+        outputs={"displacement": Output("x", "m")},
+    )
+
+
+@pytest.mark.parametrize(
+    ("input_noise", "noise"), [(0.1, 1e-3), (1e-4, 0.1)], ids=["of the force", "of the output"]
+)
+def test_the_deviation_of_an_estimate_counts_the_noise_of_a_measured_input(input_noise, noise):
+    """An error of a force's harmonic repeats in every period; white noise would average out."""
+    distances, white = [], []
+    for seed in range(10):
+        records = multisine_campaign(
+            resonance, seed, realisations=1, input_noise=input_noise, noise=noise
+        ).records
+        state = fit_state(
+            Assembly(resonator(), "force"), assign(records), Numerics(jobs=1, backend="numpy")
+        )
+        point = state.fit.point
+        for k, name in enumerate(state.fit.problem.names):
+            error = point.theta[k] - TRUE[name]
+            distances.append(error / state.sd_of(name))
+            white.append(error / point.sd[k])
+    # The root mean square of twenty distances lies within 0.6 and 1.5 (chance 0.1 %).
+    size = np.sqrt(np.mean(np.square(distances)))
+    assert 0.6 < size < 1.5
+    if input_noise > noise:
+        assert np.sqrt(np.mean(np.square(white))) > 2.0 * size
+    assert state.sd_of("mass") is None
