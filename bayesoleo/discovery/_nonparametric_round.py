@@ -21,7 +21,12 @@ from scipy import stats
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import AddedEffect, Roles
 from bayesoleo.discovery._fit import ModelFit, Numerics
-from bayesoleo.discovery._hold_out_confirmation import confirmed, contradicted
+from bayesoleo.discovery._hold_out_confirmation import (
+    confirmed,
+    contradicted,
+    fall_on_hold_out,
+    judged,
+)
 from bayesoleo.discovery._nonparametric_quantities import ranges
 from bayesoleo.discovery._nonparametric_search import CurveSearch, Tried, closest, search
 from bayesoleo.discovery._policy import SearchPolicy
@@ -120,9 +125,8 @@ def _decided(
     reasons, common = [outcome.reason], chances[-1].base
     # A single named effect that leaves only noise is no sum of effects with a common law as their
     # cause: the more likely model of the two is then taken.
-    alone = outcome.before.at_floor and len(outcome.before.assembly.steps) == 1
     policy = numerics.policy
-    favour = 0.0 if alone else policy.decisive
+    favour = 0.0 if _alone(outcome.before) else policy.decisive
     merit = partial(_merit, present=outcome.before.fit, reference=common, favour=favour)
     for k in range(policy.curves_tried):
         answers = [item for chance in chances for item in chance.answers(k, merit, numerics)]
@@ -132,6 +136,11 @@ def _decided(
                 return accepted
             reasons.append(reason)
     return replace(outcome, reason="; ".join(reasons))
+
+
+def _alone(state: State) -> bool:
+    """Whether a single named effect leaves only noise."""
+    return state.at_floor and len(state.assembly.steps) == 1
 
 
 def _better(answers: Sequence[_Answer], merit: Merit) -> list[_Answer]:
@@ -274,6 +283,11 @@ def _accepting(
         return outcome, f"{item.effect} leaves more than the named effects"
     if answer.instead and contradicted(outcome.before, after, result.inflation):
         return outcome, f"{item.effect} predicts hold-out runs worse than the named effects"
+    if answer.instead and _alone(outcome.before):
+        pair = judged(outcome.before, after)
+        if after.hold_errors.entries and fall_on_hold_out(*pair, result.inflation).value <= 0:
+            named = outcome.before.assembly.steps[0].effect.id
+            return outcome, f"{item.effect} predicts hold-out runs no better than {named}"
     if answer.instead:
         before = [step.effect.id for step in outcome.before.assembly.steps]
         reason += f", and replaces {' and '.join(before)}, which only resembled it"
