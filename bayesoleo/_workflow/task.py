@@ -36,6 +36,7 @@ from bayesoleo.data._frequency_response import (
     frequency_response,
     has_multisine,
 )
+from bayesoleo.data._held_inputs import count_steps
 from bayesoleo.data._reduction import ReducedCampaign, reduce_campaign
 from bayesoleo.discovery._assembly import Assembly, Roles, assign
 from bayesoleo.discovery._fit import ModelFit
@@ -371,6 +372,8 @@ def prepare(
         )
     _check_units(driven, reduced.campaign)
     reduced = within_bands(reduced, driven)
+    for sentence in stepped_inputs(reduced, driven):
+        warnings.warn(sentence, DataWarning, stacklevel=2)
     return Task(reduced, assign(reduced.records), assembly, settings)
 
 
@@ -378,6 +381,36 @@ def _compile_ahead(jobs: int | None) -> None:
     """Begin in another process with what has to be compiled, where nothing is yet."""
     if min(thread_limit(), jobs or available_cores()) > 1 and not is_compiled(linear):
         begin_elsewhere("bayesoleo.discovery._compile_ahead", "compile_ahead")
+
+
+def stepped_inputs(reduced: ReducedCampaign, model: Model) -> list[str]:
+    """Sentences on inputs of a model that change in steps, where nothing says how they go on from
+    one sample to the next.
+
+    Parameters
+    ----------
+    reduced : ReducedCampaign
+    model : Model
+        In the drive in which it is solved.
+    """
+    found = []
+    for name, channel in reduced.campaign.channels.items():
+        if name not in model.inputs or channel.held:
+            continue
+        steps = {r.label: count_steps(r.samples[name]) for r in reduced.records}
+        runs = [r for r in reduced.records if steps[r.label]]
+        if not runs:
+            continue
+        first = runs[0]
+        half = 0.5 * (first.time[-1] - first.time[0]) / (first.time.size - 1)
+        others = f" and {len(runs) - 1} more" if len(runs) > 1 else ""
+        found.append(
+            f"run {first.label}{others}: {name} changes in steps, {steps[first.label]} in"
+            f" {first.time.size} samples. If a controller holds it from one sample to the next,"
+            f" write held = true under [channels.{name}]: a line between samples leads it by"
+            f" {half:.3g} s, half a sample, and a lag of that size would be found"
+        )
+    return found
 
 
 def within_bands(reduced: ReducedCampaign, model: Model) -> ReducedCampaign:

@@ -41,7 +41,7 @@ _TOP = (
     *("format", "name", "description", "controlled", "dataset", "outside_files", "channels"),
     *("rig", "runs"),
 )
-_CHANNEL = ("column", "unit", "scale", "offset", "accuracy", "bandwidth")
+_CHANNEL = ("column", "unit", "scale", "offset", "accuracy", "bandwidth", "held")
 
 
 def load_table(path: Path) -> dict[str, Any]:
@@ -110,7 +110,8 @@ def get_value(
         raise CampaignError("missing", file=FILE, run=run, key=key, hint=f"write {hint}")
     value = table[key]
     good = isinstance(value, Real) if kind is float else isinstance(value, kind)
-    if isinstance(value, bool) or not good or (kind is float and not np.isfinite(value)):
+    odd = isinstance(value, bool) and kind is not bool
+    if odd or not good or (kind is float and not np.isfinite(value)):
         raise CampaignError(
             "wrong kind of value", file=FILE, run=run, key=key, value=value, hint=f"write {hint}"
         )
@@ -474,6 +475,8 @@ class Channel:
     bandwidth : float, optional
         Frequency up to which the channel counts as an input, Hz; infinite for all of it. Where it
         is not given the channel's spectrum decides.
+    held : bool
+        Whether its value is held from one sample to the next where it is an input.
     """
 
     name: str
@@ -484,6 +487,7 @@ class Channel:
     offset: float | str = 0.0
     accuracy: float | None = None
     bandwidth: float | None = None
+    held: bool = False
 
     def to_si(self, values: np.ndarray) -> np.ndarray:
         """SI samples of a run from what its file holds: scale, offset, unit, in this order."""
@@ -637,4 +641,5 @@ def _channel(name: str, table: Any) -> Channel:
         offset=offset,
         accuracy=None if accuracy is None else accuracy * unit.factor,
         bandwidth=bandwidth,
+        held=get_value(table, f"{inside}.held", bool, "true or false", default=False),
     )

@@ -19,6 +19,7 @@ from bayesoleo._types import Array
 from bayesoleo.data._campaign import CampaignData
 from bayesoleo.data._fourier import HarmonicBasis
 from bayesoleo.data._harmonics import significant_harmonics, within_bandwidth
+from bayesoleo.data._held_inputs import between_samples, held_harmonics
 from bayesoleo.data._noise import average_on, innovation_noise, periodic_average
 from bayesoleo.data._residual_time_shift import Frequency, find_frequency
 from bayesoleo.data._run_samples import Run
@@ -32,7 +33,7 @@ from bayesoleo.data._sample_quality import (
 )
 from bayesoleo.errors import CampaignError, InputError, choose
 from bayesoleo.prediction._band_limited import band_limited_channels, sample_noise
-from bayesoleo.prediction._records import Record
+from bayesoleo.prediction._records import Harmonics, Record
 
 Method = Literal["band-limited", "linear"]
 
@@ -228,9 +229,7 @@ def reduce_run(run: Run) -> Record:
         frequency_sd=found.sd,
         periods=int(np.floor(time.size * step + 0.5)),
         harmonics={
-            name: within_bandwidth(
-                significant_harmonics(basis, channel), found.value, run.bandwidths.get(name)
-            )
+            name: _as_input(run, name, significant_harmonics(basis, channel), found.value)
             for name, channel in kept.items()
         },
         signal_noise={
@@ -239,6 +238,12 @@ def reduce_run(run: Run) -> Record:
         dropped_periods=dropped,
         kept=~away[first:] if away[first:].any() else None,
     )
+
+
+def _as_input(run: Run, name: str, item: Harmonics, frequency: float) -> Harmonics:
+    """Harmonics by which a channel acts."""
+    found = within_bandwidth(item, frequency, run.bandwidths.get(name))
+    return held_harmonics(found, frequency, run.time_step) if name in run.held else found
 
 
 def _settle(values: Array, time_step: float, nominal: float) -> tuple[Frequency, int, int]:
@@ -292,7 +297,10 @@ def _transient(run: Run) -> Record:
             for (name, x), values in zip(run.samples.items(), whole, strict=True)
         },
         smoothed=band_limited_channels(
-            dict(zip(run.samples, map(np.array, whole), strict=True)),
+            {
+                name: between_samples(values) if name in run.held else np.array(values)
+                for name, values in zip(run.samples, whole, strict=True)
+            },
             step,
             {name: step_of(x[~away]) for name, x in run.samples.items()},
             run.bandwidths,

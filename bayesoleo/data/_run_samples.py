@@ -50,6 +50,8 @@ class Run:
         Masked stretches, from and to, s on the file's own clock.
     bandwidths : mapping of str to float
         Frequencies up to which channels count as inputs, Hz, where declared.
+    held : frozenset of str
+        Channels whose value is held from one sample to the next.
     """
 
     label: str
@@ -65,6 +67,7 @@ class Run:
     condition_sd: Mapping[str, float] = field(default_factory=dict)
     mask: Stretches = ()
     bandwidths: Mapping[str, float] = field(default_factory=dict)
+    held: frozenset[str] = frozenset()
 
     @property
     def time_step(self) -> float:
@@ -258,6 +261,7 @@ def _made(
         condition_sd=dict(declared.condition_sd),
         mask=declared.mask,
         bandwidths={n: c.bandwidth for n, c in channels.items() if c.bandwidth is not None},
+        held=frozenset(name for name, channel in channels.items() if channel.held),
     )
 
 

@@ -1,0 +1,82 @@
+"""Inputs that a controller holds from one sample to the next, and how to recognise them.
+
+A curve through the samples of such an input leads it by half a sample on average, which a model
+that lacks nothing shows as a lag of that size (zero-order hold; Franklin, Powell and Workman 1998,
+Digital Control of Dynamic Systems, section 4.3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from bayesoleo._types import Array
+from bayesoleo.prediction._records import Harmonics
+
+#: A channel changes in steps if changes that exceed the median by such a factor hold so large a
+#: part of all squares beyond the noise's, and so many of them stand alone: those of a pulse are
+#: neighbours.
+_FACTOR, _CHANGES, _ALONE = 10.0, 0.9, 0.5
+#: Median of the absolute value of a normal variate.
+_NORMAL = 0.6745
+
+
+def between_samples(values: Array) -> Array:
+    """Samples of a held channel's course without what is above half the sampling rate.
+
+    Steps delay by half a sample and weaken a frequency ``f`` by ``sinc(f T)``. The mean of two
+    neighbours weakens it by ``cos(pi f T)``; two more neighbours make up for the difference to the
+    fourth order.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        The samples; each holds until the next.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+    """
+    longer = np.concatenate([values[:1], values[:1], values, values[-1:]])
+    near, far = longer[1:-2] + longer[2:-1], longer[:-3] + longer[3:]
+    return np.asarray((13.0 * near - far) / 24.0)
+
+
+def held_harmonics(item: Harmonics, frequency: float, step: float) -> Harmonics:
+    """Harmonics of a held channel, from those of its samples.
+
+    Parameters
+    ----------
+    item : Harmonics
+        Through the samples.
+    frequency : float
+        Fundamental, Hz.
+    step : float
+        Sampling interval, s.
+    """
+    turn = item.orders * frequency * step
+    gain = np.sinc(turn) * np.exp(-1j * np.pi * turn)
+    return replace(
+        item,
+        coefficients=item.coefficients * gain,
+        variances=item.variances * np.abs(gain) ** 2,
+    )
+
+
+def count_steps(values: Array) -> int:
+    """Number of steps of a channel that changes in steps; zero of any other.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+    """
+    changes = np.abs(np.diff(values))
+    large = changes > _FACTOR * np.median(changes)
+    if not large.any():
+        return 0
+    beside = np.convolve(large, [1, 0, 1], mode="same") > 0
+    alone = np.count_nonzero(large & ~beside) >= _ALONE * np.count_nonzero(large)
+    noise = changes.size * (np.median(changes) / _NORMAL) ** 2
+    whole = np.sum(changes[large] ** 2) >= _CHANGES * (np.sum(changes**2) - noise)
+    return int(np.count_nonzero(large)) if alone and whole else 0
