@@ -6,6 +6,9 @@ from ._assembly import (
     Roles as Roles,
     assign as assign,
 )
+from ._expected_error import (
+    EstimateCovariance as EstimateCovariance,
+)
 from ._fit import (
     ModelFit as ModelFit,
     Numerics as Numerics,

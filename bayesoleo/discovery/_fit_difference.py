@@ -20,7 +20,7 @@ from bayesoleo._types import Array
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._refit import Refit
 from bayesoleo.discovery._score_basis import Base
-from bayesoleo.discovery._score_tests import inflation_of
+from bayesoleo.discovery._score_tests import inflation_by_estimate
 from bayesoleo.discovery._transient_variance import noise_along
 
 
@@ -110,4 +110,4 @@ def _of_periodic(base: Base, left: list[Array], changes: list[Array]) -> float:
     # A score is judged by what remains without the effect's own part.
     pairs = zip(base.runs, left, changes, strict=True)
     runs = [replace(run, residual=(rest + change).ravel()) for run, rest, change in pairs]
-    return inflation_of(replace(base, runs=runs), [change.ravel() for change in changes])[0]
+    return inflation_by_estimate(replace(base, runs=runs), [c.ravel() for c in changes])[0]

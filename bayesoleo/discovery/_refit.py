@@ -19,7 +19,7 @@ from bayesoleo.discovery._assembly import Assembly
 from bayesoleo.discovery._fit import ModelFit, Numerics, fit_model, weights
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._score_basis import Base, squared_distance
-from bayesoleo.discovery._score_tests import Score, inflation_of
+from bayesoleo.discovery._score_tests import Score, inflation_by_estimate
 from bayesoleo.discovery._transient_variance import RunNoise, coloured_variance
 from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.model._model import Model
@@ -310,18 +310,18 @@ def inflation_along(
 
     Notes
     -----
-    For periodic runs it is computed as for a score, along the change by the estimate. Linearisation
-    at the null is poor for some effects, such as a lag where friction switches: its error is no
-    noise, and the estimate avoids it. The residual of a transient is seldom white, and at the null
-    it is mostly the effect itself. There the inflation is measured on the residual of the estimate.
-    Its colour is over the residual's own white level. A sum of squares is in units of the samples'
-    noise, which differences of neighbours show: slow noise and the remaining error of the model
-    are larger, and inflate it by their level too.
+    For periodic runs it is computed as for a score, along the change by the estimate, with the
+    noise of measured inputs. Linearisation at the null is poor for some effects, such as a lag
+    where friction switches: its error is no noise, and the estimate avoids it. The residual of a
+    transient is seldom white, and at the null it is mostly the effect itself. There the inflation
+    is measured on the residual of the estimate. Its colour is over the residual's own white level.
+    A sum of squares is in units of the samples' noise, which differences of neighbours show: slow
+    noise and the remaining error of the model are larger, and inflate it by their level too.
     """
     if not all(np.isfinite(change).all() for change in changes):
         return None
     if fit.all_periodic:
-        return Inflation(*inflation_of(base, changes))
+        return Inflation(*inflation_by_estimate(base, changes))
     known = colour_of(fit, names)
     if known is None:
         return None

@@ -90,6 +90,28 @@ def inflation_of(base: Base, directions: Sequence[Array]) -> tuple[float, int]:
     return max(1.0, variance / white), 0 if freedom >= ASSUMED else max(1, int(freedom))
 
 
+def inflation_by_estimate(base: Base, changes: Sequence[Array]) -> tuple[float, int]:
+    """Variance of the fall by an estimate over white noise's, and its degrees of freedom.
+
+    A score weighs the noise of measured inputs with that of the outputs. An estimate is by least
+    squares of the outputs, in which an error of an input's harmonic repeats in every period, so
+    that no difference between periods shows it.
+
+    Parameters
+    ----------
+    base : Base
+        Residuals, spectra and noise of the inputs by run.
+    changes : sequence of ndarray, shape (m,)
+        What the estimate changes in each run, in noise units, outputs one after the other.
+    """
+    value, freedom = inflation_of(base, changes)
+    white = sum(float(change @ change) for change in changes)
+    if not white > 0:
+        return value, freedom
+    moved = [run.input_noise @ change for run, change in zip(base.runs, changes, strict=True)]
+    return value + sum(float(part @ part) for part in moved) / white, freedom
+
+
 def _spectra(base: Base, r: int, direction: Array) -> tuple[NoiseSpectrum, ...]:
     """Spectra of a run's noise, without what a direction that does not repeat would explain of it.
 

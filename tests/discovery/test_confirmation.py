@@ -28,6 +28,9 @@ from bayesoleo.discovery._run_predictions import crossed
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.effects import find_effect
 
+#: A model without inputs, and a campaign without runs that are held out.
+PLAIN = SimpleNamespace(model=lambda: SimpleNamespace(inputs=()))
+NO_RUNS = SimpleNamespace(held_out=())
 RUNS = (("a", 0.5, 0.010, "fit"), ("d", 0.8, 0.008, "hold-out"), ("e", 1.6, 0.006, "hold-out"))
 
 
@@ -139,14 +142,14 @@ def test_runs_without_a_solution_are_not_said_to_speak_against_an_effect(monkeyp
     item = SimpleNamespace(effect="play", gain=0.5)
     point = SimpleNamespace(theta=np.zeros(1))
     result = SimpleNamespace(
-        share=0.5, reached=True, excludes_null=lambda: True, inflation=1.0, assembly=None,
+        share=0.5, reached=True, excludes_null=lambda: True, inflation=1.0, assembly=PLAIN,
         noise=SimpleNamespace(on_trial=1.0), fit=SimpleNamespace(point=point),
     )  # fmt: skip
     after = SimpleNamespace(hold_errors=SimpleNamespace(entries=[1]))
     monkeypatch.setattr(confirmation, "fit_state", lambda *_, **__: after)
     monkeypatch.setattr(confirmation, "judged", lambda *_: (None, None))
     monkeypatch.setattr(confirmation, "fall_on_hold_out", lambda *_: Fall(0.0, 0.0, 0.0))
-    found, reason = confirmed(None, item, result, None, NUMERICS, print)
+    found, reason = confirmed(None, item, result, NO_RUNS, NUMERICS, print)
     assert found is None
     assert reason == "play cannot be confirmed: it changes no hold-out run that is solved"
 
@@ -288,7 +291,7 @@ def test_halves_of_a_run_do_not_say_that_it_differs_from_others(
     """They share what is odd in it: a parameter of its own always repeats there."""
     refit = SimpleNamespace(
         share=0.5, reached=reached, inflation=1.0, noise=SimpleNamespace(on_trial=1.0), fall=50.0,
-        size=1, assembly=None,
+        size=1, assembly=PLAIN,
         fit=SimpleNamespace(point=SimpleNamespace(theta=None)), excludes_null=lambda: True,
     )  # fmt: skip
     after = SimpleNamespace(hold_errors=SimpleNamespace(entries=[1]))
@@ -300,7 +303,7 @@ def test_halves_of_a_run_do_not_say_that_it_differs_from_others(
     falls = iter([Fall(9.0, 14.0, 20.0), Fall(500.0, 50.0, 500.0)])
     monkeypatch.setattr(confirmation, "fall_on_hold_out", lambda *_: next(falls))
     item = SimpleNamespace(effect="varies_by_run", gain=0.5, absorbs=absorbs)
-    found, _ = confirmation.confirmed(None, item, refit, None, NUMERICS, lambda _: None)
+    found, _ = confirmation.confirmed(None, item, refit, NO_RUNS, NUMERICS, lambda _: None)
     assert (found is not None) == bool(seen) == asked
 
 

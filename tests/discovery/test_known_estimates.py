@@ -8,7 +8,11 @@ from multisines import multisine_campaign, resonance
 
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._fit import Numerics
+from bayesoleo.discovery._ranking import estimated, score_candidates
+from bayesoleo.discovery._refit import refit
+from bayesoleo.discovery._score_tests import corrected_p
 from bayesoleo.discovery._state import fit_state
+from bayesoleo.effects import find_effect
 from bayesoleo.model import Dof, Model, Output, Parameter
 
 #: Of the resonator that makes the data: its frequency is the fortieth line of 0.5 Hz.
@@ -54,3 +58,27 @@ def test_the_deviation_of_an_estimate_counts_the_noise_of_a_measured_input(input
     if input_noise > noise:
         assert np.sqrt(np.mean(np.square(white))) > 2.0 * size
     assert state.sd_of("mass") is None
+
+
+def test_absent_effects_are_seldom_significant_beside_the_noise_of_a_measured_input():
+    """Where it did not count, all these p-values were below a twentieth, and most were zero."""
+    effects = [
+        find_effect(name) for name in ("coulomb_friction", "cubic_stiffness", "quadratic_damping")
+    ]
+    found = []
+    for seed in range(12):
+        records = multisine_campaign(
+            resonance, seed, realisations=2, input_noise=0.1, noise=1e-3
+        ).records
+        numerics = Numerics(jobs=1, backend="numpy")
+        state = fit_state(Assembly(resonator(), "force"), assign(records), numerics)
+        base = state.base()
+        for score in score_candidates(base, state.assembly, effects, 1)[0]:
+            result = refit(base, score, numerics)
+            if np.isfinite(result.share):
+                found.append(corrected_p(estimated(score, result), 1.0))
+    small = np.array(found)
+    assert small.size > 30
+    # Of 36 at 5 % each at most six (chance 0.7 %), and none below a thousandth (chance 4 %).
+    assert np.sum(small < 0.05) <= 6
+    assert not (small < 1e-3).any()
