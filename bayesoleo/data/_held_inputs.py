@@ -27,7 +27,7 @@ def between_samples(values: Array) -> Array:
 
     Steps delay by half a sample and weaken a frequency ``f`` by ``sinc(f T)``. The mean of two
     neighbours weakens it by ``cos(pi f T)``; two more neighbours make up for the difference to the
-    fourth order.
+    fourth order. At a tenth of the sampling rate the result is 0.2 % too small, at a quarter 8 %.
 
     Parameters
     ----------
@@ -72,8 +72,11 @@ def count_steps(values: Array) -> int:
     values : ndarray, shape (N,)
     """
     changes = np.abs(np.diff(values))
-    large = changes > _FACTOR * np.median(changes)
-    if not large.any():
+    median = float(np.median(changes))
+    large = changes > _FACTOR * median
+    # A converter that moves by one digit is no step, and a command between two levels is one.
+    digits = median == 0.0 and changes.max() < 1.5 * changes[large].min(initial=np.inf)
+    if not large.any() or (digits and np.unique(values).size > 2):
         return 0
     beside = np.convolve(large, [1, 0, 1], mode="same") > 0
     alone = np.count_nonzero(large & ~beside) >= _ALONE * np.count_nonzero(large)

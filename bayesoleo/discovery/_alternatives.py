@@ -52,6 +52,7 @@ from bayesoleo.discovery._score_basis import Base, squared_distance
 from bayesoleo.discovery._state import State, fit_state, state_of
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._nonparametric import FAMILY
+from bayesoleo.prediction._inputs import lacking
 
 
 @dataclass(frozen=True)
@@ -382,6 +383,8 @@ def _followed(
 ) -> Progress | None:
     opening, result = progress.rounds[0], first.refit
     assert result is not None
+    if lacking(result.assembly.model().inputs, roles.held_out) is not None:
+        return None
     after, reason = confirmed(opening.before, first, result, roles, numerics, callback)
     provisional = after is None
     if after is None:

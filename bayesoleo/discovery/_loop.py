@@ -256,7 +256,8 @@ class ClosedLoop:
     @property
     def _shown_by_hold_out(self) -> bool:
         """Whether the error of the declared model in a hold-out run is beyond what chance allows
-        now. Where the parameters are so little known there that it is not, the run tests nothing.
+        now, or there is no solution without what was added. Where the parameters are so little
+        known there that it is not, the run tests nothing.
         """
         final = self.final.hold_errors
         return any(

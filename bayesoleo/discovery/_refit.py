@@ -329,7 +329,15 @@ def inflation_along(
     # The level is that of all runs together; where a quiet run tells of the effect, both together
     # are small, whatever each of them is.
     value = max(1.0, colour * _level_along(base, fit, changes))
-    return Inflation(value, freedom, max(1.0, colour))
+    # Averages over the spectrum do not show what repeats with the periodic runs among them.
+    white = sum(float(change @ change) for change in changes)
+    moved = sum(
+        run.by_inputs(change, weighed=True)
+        for run, change, record in zip(base.runs, changes, fit.records, strict=True)
+        if record.periodic
+    )
+    by_inputs = moved / white if white > 0 else 0.0
+    return Inflation(value + by_inputs, freedom, max(1.0, colour) + by_inputs)
 
 
 def colour_of(fit: ModelFit, names: Sequence[str]) -> tuple[float, int] | None:

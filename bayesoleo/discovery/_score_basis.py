@@ -31,7 +31,7 @@ from bayesoleo.prediction._mesh_steps import WHOLE
 from bayesoleo.prediction._periodic_run import PredictedSamples, RunPredictor
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
-from bayesoleo.prediction._run_errors import input_columns
+from bayesoleo.prediction._run_errors import errors_known, input_columns
 from bayesoleo.solvers._orbit import Status
 
 #: A squared residual norm below this part of the squared norm is no direction of its own: the
@@ -339,7 +339,7 @@ class RunBase:
         With respect to present unknowns, each in units of its prior's standard deviation.
     input_noise : ndarray, shape (k, m)
         ``B``: change of the outputs by one standard deviation of each input coefficient that
-        matters.
+        matters; none where they are too many.
     inverse : ndarray, shape (k, k)
         ``(I + B B')^-1``.
     period : ndarray of int, shape (m,)
@@ -350,6 +350,9 @@ class RunBase:
         Samples kept for comparing candidates with each other.
     spectra : tuple of NoiseSpectrum
         Of the outputs' noise; empty where it is taken as white.
+    unweighed : ndarray, shape (j, m)
+        The same as ``B`` by sums of many coefficients. A sum of their squares along a direction is
+        right, and their inverse is not: they are counted in variances, and weigh nothing.
     """
 
     scale: Array
@@ -362,6 +365,7 @@ class RunBase:
     moved: Array
     chosen: NDArray[np.int64]
     spectra: tuple[NoiseSpectrum, ...] = ()
+    unweighed: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @classmethod
     def of(
@@ -372,15 +376,30 @@ class RunBase:
         columns: Array,
         period: NDArray[np.int64],
         spectra: tuple[NoiseSpectrum, ...] = (),
+        *,
+        each: bool = True,
     ) -> RunBase:
-        """Keep the directions of input noise that matter against the noise of the samples."""
+        """Keep the directions of input noise that matter against the noise of the samples, of which
+        ``each`` is one coefficient, or a sum of many."""
         columns = columns * scale
         size = np.sum(columns**2, axis=1)
-        kept = columns[np.argsort(-size)[: min(MOST_DIRECTIONS, int(np.sum(size > NEGLIGIBLE)))]]
+        count = int(np.sum(size > NEGLIGIBLE))
+        kept, none = columns[np.argsort(-size)[:count]], columns[:0]
+        kept, unweighed = (kept, none) if each and count <= MOST_DIRECTIONS else (none, kept)
         inverse = np.linalg.inv(np.eye(len(kept)) + kept @ kept.T)
         e, J = residual * scale, sensitivity * scale
         chosen = _choice(e.size)
-        return cls(scale, e, J, kept, inverse, period, kept @ J.T, kept @ e, chosen, spectra)
+        mixed, moved = kept @ J.T, kept @ e
+        return cls(
+            scale, e, J, kept, inverse, period, mixed, moved, chosen, spectra, unweighed
+        )  # fmt: skip
+
+    def by_inputs(self, direction: Array, *, weighed: bool) -> float:
+        """Variance along a direction ``(m,)`` by the noise of inputs, that which weighs in scores
+        included or not."""
+        parts = [self.unweighed] if self.unweighed.size else []
+        parts += [self.input_noise] if weighed else []
+        return sum(float(np.sum((part @ direction) ** 2)) for part in parts)
 
     def products(self, new: Array) -> tuple[Array, Array, Array]:
         """``J' W C``, ``C' W C`` and ``C' W e`` for new columns ``C (k, m)`` in noise units."""
@@ -517,6 +536,7 @@ def _run_base(
         flat(from_input * borne_out[:, None, None]),
         np.tile(replicate(record, fit.policy), len(sigma)),
         spectra,
+        each=not record.periodic or errors_known(run),
     )
 
 

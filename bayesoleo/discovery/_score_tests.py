@@ -87,6 +87,10 @@ def inflation_of(base: Base, directions: Sequence[Array]) -> tuple[float, int]:
     )
     if unsteady:
         variance, freedom = between, degrees
+    # Errors of the inputs repeat, so that no difference between periods shows them.
+    variance += sum(
+        run.by_inputs(d, weighed=False) for run, d in zip(base.runs, directions, strict=True)
+    )
     return max(1.0, variance / white), 0 if freedom >= ASSUMED else max(1, int(freedom))
 
 
@@ -108,8 +112,11 @@ def inflation_by_estimate(base: Base, changes: Sequence[Array]) -> tuple[float, 
     white = sum(float(change @ change) for change in changes)
     if not white > 0:
         return value, freedom
-    moved = [run.input_noise @ change for run, change in zip(base.runs, changes, strict=True)]
-    return value + sum(float(part @ part) for part in moved) / white, freedom
+    moved = sum(
+        run.by_inputs(c, weighed=True) - run.by_inputs(c, weighed=False)
+        for run, c in zip(base.runs, changes, strict=True)
+    )
+    return value + moved / white, freedom
 
 
 def _spectra(base: Base, r: int, direction: Array) -> tuple[NoiseSpectrum, ...]:

@@ -22,6 +22,7 @@ from bayesoleo.discovery._hold_out_confirmation import Fall, fall_on_hold_out, j
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._refit import Refit
 from bayesoleo.discovery._state import State, fit_state
+from bayesoleo.prediction._inputs import lacking
 
 #: Effects that are followed.
 MOST = 3
@@ -66,8 +67,10 @@ def confirmed_together(
         item for item in ranking if item.refitted and not item.absorbs and item.may_be_tried(level)
     ]
     for item in [one for one in able if _may_be(refits[id(one.score)])][:MOST]:
-        callback(f"follow {item.effect} one round further")
         result = refits[id(item.score)]
+        if lacking(result.assembly.model().inputs, roles.held_out) is not None:
+            continue
+        callback(f"follow {item.effect} one round further")
         one = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
         if np.isnan(one.worst_ratio):
             continue

@@ -108,6 +108,9 @@ def test_steps_are_told_from_what_moves_smoothly(noise):
     assert count_steps(steps + dither) == np.count_nonzero(np.diff(steps))
     single = np.where(time > 20.0, 1.0, 0.0)
     assert count_steps(single + dither) == 1
+    digits = np.round(np.sin(0.3 * time) / 0.01) * 0.01
+    assert count_steps(digits) == 0
+    assert count_steps(np.round(digits + dither, 2)) == 0
     pulse = np.exp(-0.5 * ((time - 25.0) / 0.2) ** 2)
     for smooth in (np.sin(3.0 * time), rng.standard_normal(1000), np.zeros(1000), time, pulse):
         assert count_steps(smooth + dither) == 0

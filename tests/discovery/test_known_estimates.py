@@ -82,3 +82,26 @@ def test_absent_effects_are_seldom_significant_beside_the_noise_of_a_measured_in
     # Of 36 at 5 % each at most six (chance 0.7 %), and none below a thousandth (chance 4 %).
     assert np.sum(small < 0.05) <= 6
     assert not (small < 1e-3).any()
+
+
+@pytest.mark.parametrize("lines", [60, 200], ids=["a coefficient each", "sums of coefficients"])
+def test_scores_of_absent_effects_count_the_noise_of_every_input_coefficient(lines):
+    """Where the largest 256 coefficients alone counted, scores were significant."""
+    effects = [
+        find_effect(name) for name in ("coulomb_friction", "cubic_stiffness", "quadratic_damping")
+    ]
+    found = []
+    for seed in range(8):
+        records = multisine_campaign(
+            resonance, seed, realisations=1, orders=range(1, lines + 1), input_noise=0.1,
+            noise=1e-3,
+        ).records  # fmt: skip
+        numerics = Numerics(jobs=1, backend="numpy")
+        state = fit_state(Assembly(resonator(), "force"), assign(records), numerics)
+        scores, _ = score_candidates(state.base(), state.assembly, effects, 1)
+        found += [corrected_p(score, 1.0) for score in scores]
+    small = np.array(found)
+    assert small.size == 24
+    # Of 24 at 5 % each at most five (chance 0.7 %), and none below a thousandth (chance 2 %).
+    assert np.sum(small < 0.05) <= 5
+    assert not (small < 1e-3).any()
