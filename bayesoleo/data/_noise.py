@@ -386,8 +386,12 @@ class NoiseSpectrum:
 
     @property
     def free(self) -> float:
-        """Degrees of freedom of :attr:`noise` squared."""
-        return self.freedom(np.where(self._harmonic(), self.weights, 0.0))
+        """Degrees of freedom of :attr:`noise` squared, as of normal noise.
+
+        The scatter of a few loud lines, such as those of the mains, tells of the noise at them:
+        with it any excess elsewhere would be within chance.
+        """
+        return self._freedom(np.where(self._harmonic(), self.weights, 0.0), 1.0)
 
     def _harmonic(self) -> NDArray[np.bool_]:
         return np.asarray(np.arange(self.level.size) % self.lines == 0)
@@ -403,8 +407,10 @@ class NoiseSpectrum:
 
     def freedom(self, power: Array) -> float:
         """Degrees of freedom of ``power @ level``: few lines have said what the level is."""
+        return self._freedom(power, 1.0 if self.dispersion is None else self.dispersion)
+
+    def _freedom(self, power: Array, scattered: Array | float) -> float:
         measured = self._neighbours.received(power) * self.level
-        scattered = 1.0 if self.dispersion is None else self.dispersion
         scatter = float(np.sum(2.0 * scattered * measured**2 / self.weights))
         return 2.0 * float(measured.sum()) ** 2 / scatter if scatter > 0 else 0.0
 

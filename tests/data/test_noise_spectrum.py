@@ -148,3 +148,17 @@ def test_noise_made_of_lines_is_known_with_few_degrees_of_freedom(noise, free):
     # Of six hundred white ones, five or more come once in 2000 times. Lines have heavier tails than
     # any normal noise; judged by ten lines of two degrees, 25 of theirs were beyond.
     assert np.sum(np.array(p_values) < 0.001) < (5 if white else 14)
+
+
+def test_a_loud_line_does_not_let_an_excess_elsewhere_pass():
+    """Mains hum between two periods: the noise away from it is known as well as without it."""
+    rng, size = np.random.default_rng(0), 4096
+    rest = rng.standard_normal(size)
+    hum = 5.0 * np.cos(2 * np.pi * 301.0 * np.arange(size) / size)
+    quiet, loud = (noise_spectrum(values, 2) for values in (rest, rest + hum))
+    # The hum's part of the level comes from some 80 lines on either side.
+    assert quiet.free > 1000.0
+    assert loud.free > 50.0
+    about = np.zeros(loud.level.size)
+    about[296:308:2] = 1.0
+    assert loud.freedom(about) < 5.0
