@@ -31,6 +31,7 @@ from bayesoleo.discovery._hold_out_confirmation import (
     fall_error,
     fall_on_hold_out,
     judged,
+    lacks_input,
     with_error,
 )
 from bayesoleo.discovery._policy import SearchPolicy
@@ -52,7 +53,6 @@ from bayesoleo.discovery._score_basis import Base, squared_distance
 from bayesoleo.discovery._state import State, fit_state, state_of
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._nonparametric import FAMILY
-from bayesoleo.prediction._inputs import lacking
 
 
 @dataclass(frozen=True)
@@ -383,7 +383,7 @@ def _followed(
 ) -> Progress | None:
     opening, result = progress.rounds[0], first.refit
     assert result is not None
-    if lacking(result.assembly.model().inputs, roles.held_out) is not None:
+    if lacks_input(result, roles) is not None:
         return None
     after, reason = confirmed(opening.before, first, result, roles, numerics, callback)
     provisional = after is None

@@ -333,6 +333,11 @@ def surrogate_variance(change: Array, left: Array) -> float:
     return float(power.sum() / change.size**2)
 
 
+def lacks_input(result: Refit, roles: Roles) -> str | None:
+    """Why a hold-out run cannot be predicted with an estimated effect; None where all can."""
+    return lacking(result.assembly.model().inputs, roles.held_out)
+
+
 def confirmed(
     state: State,
     item: Ranked,
@@ -359,7 +364,7 @@ def confirmed(
             None,
             f"the posterior of {item.effect} does not exclude its null: {_on_fitted(result)}",
         )
-    reason = lacking(result.assembly.model().inputs, roles.held_out)
+    reason = lacks_input(result, roles)
     if reason is not None:
         return None, f"{item.effect} cannot be confirmed: {reason}"
     callback(f"confirm {item.effect} on hold-out runs")

@@ -18,11 +18,15 @@ from scipy import stats
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import Roles
 from bayesoleo.discovery._fit import Numerics
-from bayesoleo.discovery._hold_out_confirmation import Fall, fall_on_hold_out, judged
+from bayesoleo.discovery._hold_out_confirmation import (
+    Fall,
+    fall_on_hold_out,
+    judged,
+    lacks_input,
+)
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._refit import Refit
 from bayesoleo.discovery._state import State, fit_state
-from bayesoleo.prediction._inputs import lacking
 
 #: Effects that are followed.
 MOST = 3
@@ -68,7 +72,7 @@ def confirmed_together(
     ]
     for item in [one for one in able if _may_be(refits[id(one.score)])][:MOST]:
         result = refits[id(item.score)]
-        if lacking(result.assembly.model().inputs, roles.held_out) is not None:
+        if lacks_input(result, roles) is not None:
             continue
         callback(f"follow {item.effect} one round further")
         one = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)

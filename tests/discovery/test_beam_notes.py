@@ -26,6 +26,7 @@ def ended(*effects: str, notes: tuple[str, ...] = ()) -> Progress:
 def test_what_befell_one_search_is_not_said_of_another(monkeypatch, notes):
     """The note on the roles holds for both."""
     monkeypatch.setattr(beam, "confirmed", lambda *_: (SimpleNamespace(), "it explains more"))
+    monkeypatch.setattr(beam, "lacks_input", lambda *_: None)
     opening = SimpleNamespace(before=None, ranking=(), failed={}, tests=1.0, accepted=None)
     progress = Progress(None, ended("play").state, (opening,), notes)
     first = SimpleNamespace(refit=SimpleNamespace())

@@ -51,6 +51,7 @@ def looked(monkeypatch, items, then, falls, held=(1,)):
         return accepted, after
 
     monkeypatch.setattr(two_effects, "fit_state", fitted)
+    monkeypatch.setattr(two_effects, "lacks_input", lambda *_: None)
     monkeypatch.setattr(two_effects, "judged", lambda before, after: (before, after))
     monkeypatch.setattr(
         two_effects,
