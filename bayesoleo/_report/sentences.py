@@ -277,7 +277,7 @@ def _unexplained(summary: Mapping[str, Any]) -> str:
         for one in summary["rounds"]
         for c in one["candidates"]
     )
-    tried = "was tried in an earlier round alone" if earlier else "was not tried"
+    tried = "was tried in an earlier round" if earlier else "was not tried"
     return f"; {nearest} would explain {share} of the excess, and {tried}"
 
 

@@ -18,6 +18,8 @@ from bayesoleo.prediction._records import Harmonics
 #: part of all squares beyond the noise's, and so many of them stand alone: those of a pulse are
 #: neighbours.
 _FACTOR, _CHANGES, _ALONE = 10.0, 0.9, 0.5
+#: Part of the swing below which a smallest change may be a converter's digit.
+_DIGIT = 0.05
 #: Median of the absolute value of a normal variate.
 _NORMAL = 0.6745
 
@@ -74,9 +76,11 @@ def count_steps(values: Array) -> int:
     changes = np.abs(np.diff(values))
     median = float(np.median(changes))
     large = changes > _FACTOR * median
-    # A converter that moves by one digit is no step, and a command between two levels is one.
-    digits = median == 0.0 and changes.max() < 1.5 * changes[large].min(initial=np.inf)
-    if not large.any() or (digits and np.unique(values).size > 2):
+    if not large.any():
+        return 0
+    # A few digits of a converter are no step: small beside the swing, as those of no command.
+    digit = float(changes[large].min())
+    if median == 0.0 and digit < _DIGIT * np.ptp(values) and changes.max() < _FACTOR * digit:
         return 0
     beside = np.convolve(large, [1, 0, 1], mode="same") > 0
     alone = np.count_nonzero(large & ~beside) >= _ALONE * np.count_nonzero(large)

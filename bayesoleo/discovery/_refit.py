@@ -332,7 +332,7 @@ def inflation_along(
     # Averages over the spectrum do not show what repeats with the periodic runs among them.
     white = sum(float(change @ change) for change in changes)
     moved = sum(
-        run.by_inputs(change, weighed=True)
+        run.weighed_noise(change) + run.unweighed_noise(change)
         for run, change, record in zip(base.runs, changes, fit.records, strict=True)
         if record.periodic
     )

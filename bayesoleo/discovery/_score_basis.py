@@ -394,12 +394,13 @@ class RunBase:
             scale, e, J, kept, inverse, period, mixed, moved, chosen, spectra, unweighed
         )  # fmt: skip
 
-    def by_inputs(self, direction: Array, *, weighed: bool) -> float:
-        """Variance along a direction ``(m,)`` by the noise of inputs, that which weighs in scores
-        included or not."""
-        parts = [self.unweighed] if self.unweighed.size else []
-        parts += [self.input_noise] if weighed else []
-        return sum(float(np.sum((part @ direction) ** 2)) for part in parts)
+    def weighed_noise(self, direction: Array) -> float:
+        """Variance along a direction ``(m,)`` by the noise of inputs by which scores weigh."""
+        return float(np.sum((self.input_noise @ direction) ** 2))
+
+    def unweighed_noise(self, direction: Array) -> float:
+        """The same by that of inputs with too many coefficients."""
+        return float(np.sum((self.unweighed @ direction) ** 2)) if self.unweighed.size else 0.0
 
     def products(self, new: Array) -> tuple[Array, Array, Array]:
         """``J' W C``, ``C' W C`` and ``C' W e`` for new columns ``C (k, m)`` in noise units."""

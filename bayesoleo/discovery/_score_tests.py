@@ -38,6 +38,7 @@ from bayesoleo.discovery._score_basis import (
 )
 from bayesoleo.effects._places import balance_of
 from bayesoleo.effects._terms import FAMILY as TERMS
+from bayesoleo.prediction._inputs import lacking
 from bayesoleo.solvers._orbit import Status
 
 if TYPE_CHECKING:
@@ -88,9 +89,7 @@ def inflation_of(base: Base, directions: Sequence[Array]) -> tuple[float, int]:
     if unsteady:
         variance, freedom = between, degrees
     # Errors of the inputs repeat, so that no difference between periods shows them.
-    variance += sum(
-        run.by_inputs(d, weighed=False) for run, d in zip(base.runs, directions, strict=True)
-    )
+    variance += sum(r.unweighed_noise(d) for r, d in zip(base.runs, directions, strict=True))
     return max(1.0, variance / white), 0 if freedom >= ASSUMED else max(1, int(freedom))
 
 
@@ -112,10 +111,7 @@ def inflation_by_estimate(base: Base, changes: Sequence[Array]) -> tuple[float, 
     white = sum(float(change @ change) for change in changes)
     if not white > 0:
         return value, freedom
-    moved = sum(
-        run.by_inputs(c, weighed=True) - run.by_inputs(c, weighed=False)
-        for run, c in zip(base.runs, changes, strict=True)
-    )
+    moved = sum(run.weighed_noise(c) for run, c in zip(base.runs, changes, strict=True))
     return value + moved / white, freedom
 
 
@@ -317,7 +313,9 @@ def _apart_with_columns(
 
 def columns_of(fit: ModelFit, option: Option) -> list[Block] | Status:
     """Derivatives of the outputs with respect to an option's new unknowns, for each set of shapes
-    in the order of :func:`shapes_of`."""
+    in the order of :func:`shapes_of`; no solution where a run lacks an input that it adds."""
+    if lacking(option.model.inputs, fit.records) is not None:
+        return Status.INADMISSIBLE
     fixed = [name for name in option.model.estimated() if name not in option.candidate.parameters]
     return sensitivities_of(fit, option.model.fixing(*fixed), shapes_of(option))
 

@@ -28,7 +28,6 @@ from bayesoleo.discovery._score_tests import columns_of
 from bayesoleo.effects._effect import Effect
 from bayesoleo.error_models._signatures import Signatures, alike, curves_of, equal_shares
 from bayesoleo.estimation._campaign_problem import CampaignProblem
-from bayesoleo.prediction._inputs import lacking
 from bayesoleo.prediction._records import Record
 from bayesoleo.solvers._orbit import Status
 
@@ -338,9 +337,7 @@ class FittedSignatures:
         known = scanned.take(fit, assembly, effects) if scanned else None
         if known is None:
             scales = scales_of(fit, assembly.drive, tuple(assembly.native.dofs))
-            every = assembly.options(scales, None if effects is None else tuple(effects))
-            records = (*fit.records, *(one.record for one in held_out))
-            options = [one for one in every if lacking(one.model.inputs, records) is None]
+            options = assembly.options(scales, None if effects is None else tuple(effects))
             known = options, process_map(columns_of, fit, options, jobs)
         sensitivity = _sensitivity(fit, noise)
         gram, groups = sensitivity @ sensitivity.T, list[_Group]()

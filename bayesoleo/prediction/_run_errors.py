@@ -70,11 +70,11 @@ def input_columns(run: RunPredictor, p: Array) -> Array:
     Returns
     -------
     ndarray, shape (ny, k, N)
-        Real and imaginary parts of all significant harmonics of all inputs, of very many some
-        neighbours together, see :func:`errors_known`; of a transient the
-        lines of the noise that its inputs hold, or where these are too many draws over the root of
-        their number, and the errors of channels that its start is read from; SI; no columns where
-        the run could not be solved.
+        Real and imaginary parts of all significant harmonics of all inputs, or sums of neighbours
+        where these are very many (:func:`errors_known`). Of a transient the lines of the noise that
+        its inputs hold, or where these are too many draws over the root of their number, and the
+        errors of channels that its start is read from. SI; no columns where the run could not be
+        solved.
     """
     derived = run.kernels.derived
     ny, samples = run.measured.shape

@@ -108,9 +108,6 @@ def test_steps_are_told_from_what_moves_smoothly(noise):
     assert count_steps(steps + dither) == np.count_nonzero(np.diff(steps))
     single = np.where(time > 20.0, 1.0, 0.0)
     assert count_steps(single + dither) == 1
-    digits = np.round(np.sin(0.3 * time) / 0.01) * 0.01
-    assert count_steps(digits) == 0
-    assert count_steps(np.round(digits + dither, 2)) == 0
     pulse = np.exp(-0.5 * ((time - 25.0) / 0.2) ** 2)
     for smooth in (np.sin(3.0 * time), rng.standard_normal(1000), np.zeros(1000), time, pulse):
         assert count_steps(smooth + dither) == 0
@@ -141,3 +138,21 @@ def test_held_is_true_or_false(folder):
     with pytest.raises(Exception, match=r"channels\.u\.held.*true or false"):
         load_campaign(folder)
     file.write_text(file.read_text().replace('held = "yes"\n', ""))
+
+
+@pytest.mark.parametrize("frequency", [0.02, 0.2, 3.0])
+@pytest.mark.parametrize("digit", [0.002, 0.03])
+@pytest.mark.parametrize("noise", [0.0, 0.1, 0.3, 1.0])
+def test_digits_of_a_converter_are_no_steps(frequency, digit, noise):
+    rng, time = np.random.default_rng(0), 0.01 * np.arange(4000)
+    values = np.sin(2 * np.pi * frequency * time) + noise * digit * rng.standard_normal(time.size)
+    assert count_steps(np.round(values / digit) * digit) == 0
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.001, 0.02])
+@pytest.mark.parametrize("levels", [2, 3, 5])
+def test_steps_between_a_few_levels_are_counted(levels, noise):
+    rng = np.random.default_rng(0)
+    values = (np.cumsum(rng.random(4000) < 0.05) * (levels - 1) % levels).astype(float)
+    steps = np.count_nonzero(np.diff(values))
+    assert count_steps(values + noise * rng.standard_normal(4000)) == steps

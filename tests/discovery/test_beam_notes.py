@@ -35,6 +35,15 @@ def test_what_befell_one_search_is_not_said_of_another(monkeypatch, notes):
     assert found.notes == tuple(note for note in notes if note == ROLES)
 
 
+def test_no_search_begins_with_what_hold_out_runs_lack_an_input_for(monkeypatch):
+    monkeypatch.setattr(beam, "lacks_input", lambda *_: "no first harmonic")
+    monkeypatch.setattr(beam, "confirmed", lambda *_: pytest.fail("it cannot be predicted"))
+    opening = SimpleNamespace(before=None, ranking=(), failed={}, tests=1.0, accepted=None)
+    progress = Progress(None, ended("play").state, (opening,), ())
+    first = SimpleNamespace(refit=SimpleNamespace())
+    assert beam._followed(progress, first, None, None, lambda other, _: other, 4, print) is None
+
+
 def test_a_model_that_leaves_more_is_not_said_to_leave_less():
     """Causes go before what merely varies from run to run, at a small price."""
     told = [

@@ -25,6 +25,7 @@ from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._loop import close_loop
 from bayesoleo.discovery._ranking import line_of, scales_of, score_candidates
 from bayesoleo.discovery._score_tests import score_all
+from bayesoleo.discovery._signatures import noise_of, signatures_of
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.discovery._summary import summarise
 from bayesoleo.effects import catalogue, find_effect
@@ -266,6 +267,12 @@ def test_a_drive_without_its_first_harmonic_gives_no_phase(hum, bare):
     named = {score.option.candidate.effect for score in scores}
     assert "coulomb_friction" in named
     assert ("periodic_force" in named) is (bare == "held out")
+    # The errors of a catalogue are those of the others, in the runs where they can be.
+    found = signatures_of(
+        base.fit, base.assembly, noise_of(base.fit), effects=FEW, held_out=base.held_out, jobs=1
+    )
+    assert any("coulomb_friction" in name for name in found.names)
+    assert any("periodic_force" in name for name in found.names) is (bare == "held out")
     if bare == "fitted":
         (reason,) = [text for name, text in failed.items() if name.startswith("periodic_force")]
         assert reason == "run a: displacement has no first harmonic, whose phase it needs"

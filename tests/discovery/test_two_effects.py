@@ -51,7 +51,11 @@ def looked(monkeypatch, items, then, falls, held=(1,)):
         return accepted, after
 
     monkeypatch.setattr(two_effects, "fit_state", fitted)
-    monkeypatch.setattr(two_effects, "lacks_input", lambda *_: None)
+    monkeypatch.setattr(
+        two_effects,
+        "lacks_input",
+        lambda result, _: "no first harmonic" if result.assembly == "clock" else None,
+    )
     monkeypatch.setattr(two_effects, "judged", lambda before, after: (before, after))
     monkeypatch.setattr(
         two_effects,
@@ -69,6 +73,13 @@ def looked(monkeypatch, items, then, falls, held=(1,)):
         str,
     )
     return found, followed
+
+
+def test_what_hold_out_runs_lack_an_input_for_is_not_followed(monkeypatch):
+    items = [ranked("clock"), ranked("friction")]
+    then = {"clock": "drag", "friction": "drag"}
+    _, followed = looked(monkeypatch, items, then, {"clock": 90.0, "friction": 20.0})
+    assert followed == ["friction"]
 
 
 def test_the_pair_that_predicts_best_is_begun(monkeypatch):

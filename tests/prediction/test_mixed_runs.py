@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from bayesoleo._workflow import predicting
 from bayesoleo.data import CampaignData, Channel, Run, reduce_campaign
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._fit import Numerics, fit_model
@@ -20,8 +21,11 @@ from bayesoleo.discovery._state import fit_state
 from bayesoleo.effects import find_effect
 from bayesoleo.model import Dof, Model, Output, Parameter
 from bayesoleo.model._drive_and_start import start_parameters
+from bayesoleo.prediction import _periodic_run as periodic_run
 from bayesoleo.prediction._mesh_steps import steps_for
 from bayesoleo.prediction._predictor import Layout, Predictor
+from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._periodic import Solution
 
 DAMPING, STIFFNESS, NOISE = 0.8, 90.0, 1e-4
 TIME = 0.01 * np.arange(1000)
@@ -173,6 +177,7 @@ def test_the_steps_of_a_broadband_cycle_are_none_of_a_transient():
     state = fit_state(assembly, assign(reduced.records), numerics)
     assert state.fit.steps >= 1024
     assert state.fit.fineness < state.fit.steps / 4
+    assert [run.fineness for run in state.fit.predictor.runs[1:]] == [state.fit.fineness]
     (last,) = state.held_out
     assert last.predictor.fineness == state.fit.fineness
     assert state.at_floor
@@ -227,8 +232,52 @@ def test_absent_effects_in_mixed_runs_count_the_noise_of_measured_inputs():
         for score in score_candidates(base, state.assembly, effects, 1)[0]:
             result = refit(base, score, numerics)
             if np.isfinite(result.share):
+                # The level of what is left exceeds its colour, and both hold the inputs' noise.
+                assert result.noise.value >= result.noise.on_trial
                 small.append(corrected_p(estimated(score, result), 1.0))
     assert len(small) > 18
     # Of 24 at 5 % each at most five (chance 0.7 %), and one below a thousandth (two: 0.03 %).
     assert np.sum(np.array(small) < 0.05) <= 5
     assert np.sum(np.array(small) < 1e-3) <= 1
+
+
+@pytest.mark.parametrize("watched", [True, False])
+def test_a_step_that_is_only_compared_is_not_shot(watched, monkeypatch):
+    """Where no path leads from the present motion, an estimate halves its step."""
+    (record,) = mixed(cycle="fit").records
+    predictor = Predictor(oscillator(), [record], steps=64, backend="numpy", jobs=1)
+    theta, asked = np.array([DAMPING, STIFFNESS]), []
+    assert predictor.set_anchor(theta) == [Status.CONVERGED]
+    (run,) = predictor.runs
+    run.watched = watched
+
+    def lost(boundary, p, guess):
+        status = np.array([Status.NO_CONVERGENCE.value])
+        return Solution(np.repeat(guess, len(p), axis=0), status, np.zeros(1, dtype=np.int64))
+
+    monkeypatch.setattr(periodic_run, "solve_from_guess", lost)
+    monkeypatch.setattr(periodic_run, "solve_from_shot", lambda *_: asked.append(1))
+    found = run.solve_from_guess(predictor.constants(theta[None], 0)[0])
+    assert found.status[0] == Status.NO_CONVERGENCE.value
+    assert bool(asked) is watched
+
+
+@pytest.mark.parametrize(("lines", "steps"), [(20, 512), (300, 4096)])
+def test_a_prediction_takes_as_many_steps_as_the_input_asks_for(lines, steps, monkeypatch):
+    made = CampaignData(
+        "mixed", "", "pull", ".", mixed(free="fit").campaign.channels,
+        (broad("broad", "fit", lines),), "",
+    )  # fmt: skip
+    (record,) = reduce_campaign(made, jobs=1).records
+
+    class AskedError(Exception):
+        pass
+
+    def refuse(*_, steps, **__):
+        raise AskedError(steps)
+
+    monkeypatch.setattr(predicting, "Predictor", refuse)
+    rest = (None, None, 0.95, "radau2", "collocation")
+    for given, expected in ((None, steps), (64, 64)):
+        with pytest.raises(AskedError, match=f"^{expected}$"):
+            predicting._one_run(oscillator(), record, *rest, given, 1)
