@@ -15,7 +15,7 @@ from bayesoleo.data import CampaignData, Channel, Run, reduce_campaign
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._fit import Numerics, fit_model
 from bayesoleo.discovery._ranking import estimated, score_candidates
-from bayesoleo.discovery._refit import refit
+from bayesoleo.discovery._refit import compare, refit
 from bayesoleo.discovery._score_tests import corrected_p
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.effects import find_effect
@@ -24,6 +24,7 @@ from bayesoleo.model._drive_and_start import start_parameters
 from bayesoleo.prediction import _periodic_run as periodic_run
 from bayesoleo.prediction._mesh_steps import steps_for
 from bayesoleo.prediction._predictor import Layout, Predictor
+from bayesoleo.prediction._run_errors import input_columns
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import Solution
 
@@ -212,6 +213,18 @@ def test_steps_of_other_runs(fitted, steps, others, expected):
     assert steps_for(oscillator(), known, steps, asked) == expected
 
 
+def by_inputs(fit, base, changes):
+    """Variance of changes in noise units by the errors of the inputs of periodic runs."""
+    found = 0.0
+    for r, (record, run) in enumerate(zip(fit.records, base.runs, strict=True)):
+        if record.periodic:
+            p = fit.predictor.constants(fit.point.theta[None], r)[0]
+            columns = input_columns(fit.predictor.runs[r], p)[0] * run.scale
+            found += float(np.sum((columns @ changes[r]) ** 2))
+    # The residual bears out nearly all of that noise.
+    return 0.9 * found
+
+
 def test_absent_effects_in_mixed_runs_count_the_noise_of_measured_inputs():
     """A transient among the runs must not hide what repeats in the others."""
     effects = [
@@ -233,7 +246,10 @@ def test_absent_effects_in_mixed_runs_count_the_noise_of_measured_inputs():
             result = refit(base, score, numerics)
             if np.isfinite(result.share):
                 # The level of what is left exceeds its colour, and both hold the inputs' noise.
+                changes = compare(base, result.fit)[1]
+                white = sum(float(change @ change) for change in changes)
                 assert result.noise.value >= result.noise.on_trial
+                assert result.noise.on_trial >= by_inputs(state.fit, base, changes) / white
                 small.append(corrected_p(estimated(score, result), 1.0))
     assert len(small) > 18
     # Of 24 at 5 % each at most five (chance 0.7 %), and one below a thousandth (two: 0.03 %).
