@@ -18,6 +18,9 @@ from bayesoleo.prediction._records import Harmonics
 #: part of all squares beyond the noise's, and so many of them stand alone: those of a pulse are
 #: neighbours.
 _FACTOR, _CHANGES, _ALONE = 10.0, 0.9, 0.5
+#: Part of a channel's variance that may be left between its steps, beside the noise (in variances):
+#: a force that jumps as friction turns goes on between its jumps.
+_BETWEEN, _BESIDE_NOISE = 0.01, 2.0
 #: Part of the swing below which a smallest change may be a converter's digit.
 _DIGIT = 0.05
 #: Median of the absolute value of a normal variate.
@@ -84,6 +87,16 @@ def count_steps(values: Array) -> int:
         return 0
     beside = np.convolve(large, [1, 0, 1], mode="same") > 0
     alone = np.count_nonzero(large & ~beside) >= _ALONE * np.count_nonzero(large)
-    noise = changes.size * (np.median(changes) / _NORMAL) ** 2
-    whole = np.sum(changes[large] ** 2) >= _CHANGES * (np.sum(changes**2) - noise)
-    return int(np.count_nonzero(large)) if alone and whole else 0
+    noise = (median / _NORMAL) ** 2
+    whole = np.sum(changes[large] ** 2) >= _CHANGES * (np.sum(changes**2) - changes.size * noise)
+    # Two neighbours' noise stands in a change.
+    most = _BETWEEN * np.var(values) + _BESIDE_NOISE * noise / 2.0
+    flat = _variance_between(values, large) <= most
+    return int(np.count_nonzero(large)) if alone and whole and flat else 0
+
+
+def _variance_between(values: Array, steps: Array) -> float:
+    """Variance of a channel about its mean from each step to the next."""
+    place = np.concatenate([[0], np.cumsum(steps)])
+    mean = np.bincount(place, values) / np.bincount(place)
+    return float(np.mean((values - mean[place]) ** 2))

@@ -156,3 +156,14 @@ def test_steps_between_a_few_levels_are_counted(levels, noise):
     values = (np.cumsum(rng.random(4000) < 0.05) * (levels - 1) % levels).astype(float)
     steps = np.count_nonzero(np.diff(values))
     assert count_steps(values + noise * rng.standard_normal(4000)) == steps
+
+
+@pytest.mark.parametrize("jump", [0.03, 0.3, 1.0])
+@pytest.mark.parametrize("noise", [0.001, 0.01])
+def test_jumps_of_a_course_that_goes_on_are_no_steps(jump, noise):
+    """A measured force jumps where friction turns its sign, and moves between."""
+    rng, time = np.random.default_rng(0), np.linspace(0.0, 1.0, 4000)
+    for cycles in (1, 4):
+        angle = 2 * np.pi * cycles * time
+        values = np.sin(angle) + jump * np.sign(np.cos(angle))
+        assert count_steps(values + noise * rng.standard_normal(time.size)) == 0
