@@ -633,8 +633,13 @@ def _likeliest(problem: CampaignProblem, starts: Array) -> Array:
 
 def _cost(problem: CampaignProblem, vectors: Array) -> Array:
     """Twice the negative logarithm of the likelihood, variances eliminated, of vectors ``(L, l)``;
-    infinite for those that could not be solved."""
-    sums, counts = problem.misfit(vectors).sum_of_squares.sum(axis=1), problem.counts.sum(axis=0)
+    infinite for those that could not be solved.
+
+    They lie far apart: a motion of another branch is as good as any, and no jump of the estimate.
+    """
+    with problem.unwatched():
+        sums = problem.misfit(vectors).sum_of_squares.sum(axis=1)
+    counts = problem.counts.sum(axis=0)
     cost = np.sum(counts * np.log(np.maximum(sums, 1e-300)), axis=1)
     return np.where(np.isfinite(cost), cost, np.inf)
 

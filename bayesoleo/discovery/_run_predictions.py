@@ -23,6 +23,7 @@ from scipy import stats
 from bayesoleo._types import Array, Float
 from bayesoleo.data._noise import innovation_noise
 from bayesoleo.discovery._assembly import RecordNoise, halves
+from bayesoleo.discovery._beginnings import beginning_of
 from bayesoleo.discovery._fit import (
     RESOLUTION,
     ModelFit,
@@ -33,6 +34,8 @@ from bayesoleo.discovery._fit import (
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._estimate import estimate
+from bayesoleo.estimation._point_estimate import PointEstimate
+from bayesoleo.model._drive_and_start import start_parameters
 from bayesoleo.prediction._mesh_steps import MOST_COMPARED, WHOLE
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
@@ -40,6 +43,9 @@ from bayesoleo.solvers._orbit import Status
 
 #: Columns whose overlap says how many independent coefficients a band holds.
 MOST_COLUMNS = 128
+#: Of estimates of a run's own parameters: its prediction asks for no certified digits, and a rough
+#: model of a long record for no hundred iterations.
+LIMITS = {"tolerance": 1e-4, "max_iterations": 30, "resolution": RESOLUTION}
 
 
 def borne_out(
@@ -244,12 +250,11 @@ def _estimated_on(
     """Prediction of a run, its own unknowns estimated on it, from where they are known."""
     problem = CampaignProblem(predictor).holding(fit.shared)
     own = len(problem.names)
-    # What is known of a nuisance parameter counts; of any other, only what the run says.
-    method = "be" if problem.nuisances.intersection(problem.names) else "mbe"
-    start = np.array([known[name] for name in problem.names]) if known else None
+    start = np.array([known[name] for name in problem.names]) if known else problem.start
     theta = np.empty(0)
     if own:
-        theta = estimate(problem, method, start=start, resolution=RESOLUTION).theta
+        told = _told_by_beginning(fit, problem, start)
+        theta = _estimate_of(problem, start).theta if told is None else told
     full = problem.full(theta[None])[0]
     status = predictor.set_anchor(full)[0]
     samples = predictor.simulate(full[None], 0)
@@ -262,6 +267,30 @@ def _estimated_on(
         status if status is not Status.CONVERGED else Status(int(samples.status[0])),
         predictor,
     )
+
+
+def _estimate_of(problem: CampaignProblem, start: Array) -> PointEstimate:
+    """What is known of a nuisance parameter counts; of any other, only what the run says."""
+    method = "be" if problem.nuisances.intersection(problem.names) else "mbe"
+    return estimate(problem, method, start=start, **LIMITS)  # type: ignore[arg-type]
+
+
+def _told_by_beginning(fit: ModelFit, problem: CampaignProblem, start: Array) -> Array | None:
+    """Where a transient starts, by the part of it that tells; None where that is most of it, or
+    the run has other unknowns."""
+    (run,) = problem.predictor.runs
+    record, layout = run.record, problem.predictor.layout
+    starts = start_parameters(fit.model)
+    owners = dict(zip(layout.names, layout.parameters, strict=True))
+    if record.periodic or not all(owners[name] in starts for name in problem.names):
+        return None
+    evaluation = problem.evaluate(start)
+    part = beginning_of(record, evaluation) if evaluation.status.ok else None
+    if part is None:
+        return None
+    predictor = _single(fit, part, problem.predictor.steps, problem.predictor)
+    found = _estimate_of(CampaignProblem(predictor).holding(fit.shared), start)
+    return found.theta if found.status.ok else None
 
 
 def crossed(prediction: Prediction) -> Prediction | None:
@@ -311,6 +340,5 @@ def _own_estimate(prediction: Prediction, record: Record) -> Array | None:
     shared = {n: v for n, v in prediction.theta.items() if n in predictor.model.parameters}
     problem = CampaignProblem(predictor).holding(shared)
     start = np.array([prediction.theta[name] for name in problem.names])
-    method = "be" if problem.nuisances.intersection(problem.names) else "mbe"
-    point = estimate(problem, method, start=start, resolution=RESOLUTION)
+    point = _estimate_of(problem, start)
     return problem.full(point.theta[None])[0] if point.status.ok else None

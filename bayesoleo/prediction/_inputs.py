@@ -7,6 +7,7 @@ from dataclasses import replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
+from scipy.fft import next_fast_len
 
 from bayesoleo._types import Array
 from bayesoleo.errors import CampaignError, ModelError
@@ -22,6 +23,9 @@ from bayesoleo.solvers._switching import InputSignal, periodic_signal
 #: Rows computed before, by grid, channel, derivative and the highest that the model takes; models
 #: of the same run share them.
 RowCache = dict[tuple[str, str, int, int], Array]
+#: With more harmonics than these their sum costs an integrator more than all else: a rough motion
+#: takes it from cubic pieces, so many in a cycle of the highest one (wrong by 2e-7 of it).
+MANY_HARMONICS, PIECES_PER_CYCLE = 32, 64
 #: Curves that are cut off where another channel is, by the whole curve and the frequency, with the
 #: samples they are of. Candidates that feed the same channel back share the curve.
 _CUT: WeakKeyDictionary[Smoothed, dict[float, tuple[Array, Smoothed]]] = WeakKeyDictionary()
@@ -220,7 +224,12 @@ def signal_of_transient(record: Record, rows: tuple[tuple[str, int], ...]) -> In
 
 
 def dynamics_of(
-    model: Model, record: Record, active: Sequence[str] | None = None, backend: str = "numba"
+    model: Model,
+    record: Record,
+    active: Sequence[str] | None = None,
+    backend: str = "numba",
+    *,
+    exact: bool = True,
 ) -> Dynamics:
     """The equations of a periodic run in analytic pieces, with its harmonics as inputs.
 
@@ -234,6 +243,8 @@ def dynamics_of(
         Parameters to differentiate by; by default those that are estimated.
     backend : {"numba", "numpy"}
         Of the kernels; NumPy's are called back from compiled code at every step, which is slow.
+    exact : bool
+        Sum all harmonics; else many of them may be cubic pieces of one period from time zero.
 
     Returns
     -------
@@ -261,15 +272,20 @@ def dynamics_of(
     return Dynamics(
         kernels=kernels(pieces.model, active, backend),
         orders=derived.orders,
-        signal=signal_of_rows(record, derived.inputs),
+        signal=signal_of_rows(record, derived.inputs, exact=exact),
         active=len(derived.active),
         conditions=len(derived.admissible),
         switches=pieces.switches,
     )
 
 
-def signal_of_rows(record: Record, rows: tuple[tuple[str, int], ...]) -> InputSignal:
-    """Fourier coefficients of input rows; the time itself, which no equation has, is left zero."""
+def signal_of_rows(
+    record: Record, rows: tuple[tuple[str, int], ...], *, exact: bool = True
+) -> InputSignal:
+    """Fourier coefficients of input rows; the time itself, which no equation has, is left zero.
+
+    Where it need not be exact, one period in pieces that are as good as a start has to be.
+    """
     used = {
         name: harmonics_of(record, name).for_derivative(highest)
         for name, highest in highest_derivatives(rows).items()
@@ -284,4 +300,25 @@ def signal_of_rows(record: Record, rows: tuple[tuple[str, int], ...]) -> InputSi
         rates = (2j * np.pi * record.frequency * item.orders) ** derivative
         row[item.orders] = np.where((item.orders == 0) & (derivative > 0), 0, rates)
         row[item.orders] *= item.coefficients
+    if not exact and count > MANY_HARMONICS:
+        return _signal_in_pieces(record.frequency, table)
     return periodic_signal(record.frequency, table.real, -table.imag)
+
+
+def _signal_in_pieces(frequency: float, table: Array) -> InputSignal:
+    """Cubic pieces of one period with the values and slopes of harmonics ``(nu, K)``."""
+    size = next_fast_len(PIECES_PER_CYCLE * table.shape[1], real=True)
+    step = 1.0 / (frequency * size)
+    half = 0.5 * size * table
+    half[:, 0] *= 2.0
+    rates = 2j * np.pi * frequency * np.arange(table.shape[1])
+    value, slope = (np.fft.irfft(part, size) for part in (half, rates * half))
+    ahead, later = (np.roll(part, -1, axis=1) for part in (value, slope))
+    chord = (ahead - value) / step
+    square, cube = 3 * chord - 2 * slope - later, slope + later - 2 * chord
+    pieces = np.stack([value, slope, square / step, cube / step**2], axis=-1)
+    nothing = np.zeros((table.shape[0], 0))
+    knots = step * np.arange(size + 1)
+    return InputSignal(
+        0.0, nothing, nothing, knots, np.ascontiguousarray(np.moveaxis(pieces, 1, 0))
+    )

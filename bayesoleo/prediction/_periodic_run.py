@@ -40,6 +40,8 @@ from bayesoleo.solvers._schemes import scheme
 
 #: Parameter vectors whose samples are evaluated together.
 CHUNK = 8
+#: Steps of a period up to which its factorisation takes some tens of milliseconds.
+FEW_STEPS = 1024
 #: Threads share a run.
 _COUNTING = threading.Lock()
 
@@ -256,7 +258,7 @@ class RunPredictor:
     def solve_from_guess(self, p: Array) -> Solution:
         """Periodic solution at constants ``p (np,)`` without an anchor."""
         guess = self.guess(p)
-        solution = solve_from_guess(self.boundary, p[None], guess)
+        solution = solve_from_guess(self.boundary, p[None], guess, exchange=self._exchanges)
         # Equations of what lags behind a motion are singular at rest, wherever their answer is.
         if solution.status[0] not in (Status.NO_CONVERGENCE.value, Status.SINGULAR.value):
             return solution
@@ -268,6 +270,12 @@ class RunPredictor:
             guess = self.anchor.x[None]  # nearer, so that shooting takes fewer passes
         found = solve_from_shot(self.model, self.kernels, self.record, self.boundary, p, guess)
         return solution if found is None else found
+
+    @property
+    def _exchanges(self) -> bool:
+        """Whether to go on where an elimination has to exchange rows: each iteration then takes a
+        factorisation of the whole period, too long for a model that is only compared."""
+        return self.watched or self.steps <= FEW_STEPS
 
     def _from_anchor(self, p: Array) -> Solution:
         anchor = self.anchor

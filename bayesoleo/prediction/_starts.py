@@ -603,7 +603,7 @@ def solve_from_shot(
     try:
         # Compiled whatever the mesh is solved with: that takes a second or two, and an integrator
         # that calls NumPy's kernels back step by step takes minutes to fail.
-        dynamics = dynamics_of(model, record, kernels.derived.active, "numba")
+        dynamics = dynamics_of(model, record, kernels.derived.active, "numba", exact=False)
     except ModelError:
         return None
     begin = np.ascontiguousarray(rows[0, states, 0, 0])

@@ -176,6 +176,7 @@ def solve_periodic(
     max_iterations: int = 40,
     monotone: bool = True,
     overwrite: bool = False,
+    exchange: bool = True,
 ) -> Solution:
     """Solve the discretised periodic problem by Newton's method with step halving.
 
@@ -195,6 +196,9 @@ def solve_periodic(
         iteration gets stuck.
     overwrite : bool
         Let the solution take the place of ``start``: a fresh copy costs a twentieth of the time.
+    exchange : bool
+        Go on with lanes whose elimination has to exchange rows, which on thousands of steps takes
+        a thousand times as long; else they have not converged.
 
     Returns
     -------
@@ -208,6 +212,9 @@ def solve_periodic(
     if problem.arranged is None:
         return _Newton(problem, p, x, max_iterations, monotone).run()
     solution = _compiled(problem, problem.arranged, p, x, max_iterations, monotone)
+    if not exchange:
+        solution.status[solution.status == NEEDS_EXCHANGE] = Status.NO_CONVERGENCE.value
+        return solution
     # Those left over are still where they started.
     return _with_exchange(problem, p, solution, x.__getitem__, max_iterations, monotone)
 
@@ -516,7 +523,9 @@ def linear_by_column(
     return dx, monodromy, ok
 
 
-def solve_from_guess(problem: Boundary, p: Array, start: Array) -> Solution:
+def solve_from_guess(
+    problem: Boundary, p: Array, start: Array, *, exchange: bool = True
+) -> Solution:
     """Solve each lane directly; those that fail by continuation in the amplitude of the inputs,
     then by undamped Newton steps.
 
@@ -528,30 +537,34 @@ def solve_from_guess(problem: Boundary, p: Array, start: Array) -> Solution:
         Constants.
     start : ndarray, shape (L, n, w)
         Where each lane starts: a guess of the full motion, or a static one.
+    exchange : bool
+        As of :func:`solve_periodic`.
 
     Returns
     -------
     Solution
     """
-    solution = solve_periodic(problem, p, start)
+    solution = solve_periodic(problem, p, start, exchange=exchange)
     x, status, iterations = solution.x.copy(), solution.status.copy(), solution.iterations.copy()
     for lane in np.flatnonzero(status != Status.CONVERGED.value):
         one = slice(lane, lane + 1)
-        better = _raise_forcing(problem, p[one], start[one])
+        better = _raise_forcing(problem, p[one], start[one], exchange)
         if better is None:
             # Where the branch from rest folds back before full amplitude, wandering steps find the
             # other branch.
-            better = solve_periodic(problem, p[one], start[one], max_iterations=200, monotone=False)
+            better = solve_periodic(
+                problem, p[one], start[one], max_iterations=200, monotone=False, exchange=exchange
+            )
         if better.status[0] == Status.CONVERGED.value:
             x[one], status[one] = better.x, better.status
             iterations[one] += better.iterations
     return Solution(x, status, iterations)
 
 
-def _raise_forcing(problem: Boundary, p: Array, start: Array) -> Solution | None:
+def _raise_forcing(problem: Boundary, p: Array, start: Array, exchange: bool) -> Solution | None:
     """Continuation of one lane from its time average under constant inputs."""
     static = np.broadcast_to(start.mean(axis=1, keepdims=True), start.shape).copy()
-    current = _at(problem, p, static, 0.0)
+    current = _at(problem, p, static, 0.0, exchange)
     if current.status[0] != Status.CONVERGED.value:
         return None
     amount, step, previous = 0.0, FIRST_STEP, None
@@ -561,7 +574,7 @@ def _raise_forcing(problem: Boundary, p: Array, start: Array) -> Solution | None
         if previous is not None:
             before, x_before = previous
             guess = current.x + (target - amount) / (amount - before) * (current.x - x_before)
-        trial = _at(problem, p, guess, target)
+        trial = _at(problem, p, guess, target, exchange)
         if trial.status[0] != Status.CONVERGED.value:
             step /= 2
             if step < SMALLEST_STEP:
@@ -573,7 +586,7 @@ def _raise_forcing(problem: Boundary, p: Array, start: Array) -> Solution | None
     return current
 
 
-def _at(problem: Boundary, p: Array, start: Array, amount: float) -> Solution:
+def _at(problem: Boundary, p: Array, start: Array, amount: float, exchange: bool) -> Solution:
     mean = problem.inputs.mean(axis=1, keepdims=True)
     scaled = replace(problem, inputs=mean + amount * (problem.inputs - mean))
-    return solve_periodic(scaled, p, start, max_iterations=15)
+    return solve_periodic(scaled, p, start, max_iterations=15, exchange=exchange)

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesoleo.discovery._fit import Numerics, fit_model
+from bayesoleo.discovery._fit import Numerics, fit_model, promising
+from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._problem import Held
 from bayesoleo.posterior import LogDensity
@@ -128,6 +129,19 @@ def test_an_estimate_that_is_only_compared_looks_for_no_jumps(monkeypatch, compa
     assert bool(looked) is not compared
     # The data are exact: both end there, to the tolerance of an estimate.
     np.testing.assert_allclose(fit.point.theta, theta, rtol=1e-4)
+
+
+def test_draws_of_the_priors_are_no_jumps_of_an_estimate():
+    """They lie on all branches, and only say where an estimate is to begin."""
+    made, _ = predictor(110.0)
+    problem = CampaignProblem(made)
+    rng = np.random.default_rng(4)
+    vectors = problem.start * np.exp(rng.uniform(-0.7, 0.7, (50, problem.start.size)))
+    problem.misfit(vectors)
+    counted = problem.branch_jumps.sum()
+    assert counted > 0  # another measure of the same draws
+    assert len(promising(problem, problem.start, SearchPolicy())) > 0
+    assert problem.branch_jumps.sum() == counted
 
 
 def walked(made: Predictor, theta: np.ndarray, end: np.ndarray) -> np.ndarray | None:

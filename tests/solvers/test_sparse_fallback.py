@@ -7,7 +7,12 @@ from periodic_problems import coupled, duffing, harmonics, problem, rest
 from bayesoleo.model import Model, Parameter
 from bayesoleo.solvers import _elimination as sparse
 from bayesoleo.solvers._orbit import Status
-from bayesoleo.solvers._periodic import Solution, sensitivities, solve_periodic
+from bayesoleo.solvers._periodic import (
+    Solution,
+    sensitivities,
+    solve_from_guess,
+    solve_periodic,
+)
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
 
@@ -59,6 +64,17 @@ def test_the_compiled_iteration_hands_over():
     assert boundary.arranged is not None
     assert found[1].status[0] == Status.CONVERGED
     np.testing.assert_allclose(found[1].x, found[0].x, atol=1e-12)
+
+
+def test_it_hands_over_only_where_that_is_wanted():
+    """A model that is only compared does not wait for a factorisation of thousands of steps."""
+    boundary, p = problem(repelled("second order"), FORCE, 0.125, "radau3", 400, "numba")
+    solution = solve_periodic(boundary, p, rest(boundary, 400), exchange=False)
+    assert solution.status[0] == Status.NO_CONVERGENCE
+    solution = solve_from_guess(boundary, p, rest(boundary, 400), exchange=False)
+    assert solution.status[0] == Status.NO_CONVERGENCE
+    solution = solve_from_guess(boundary, p, rest(boundary, 400))
+    assert solution.status[0] == Status.CONVERGED
 
 
 @pytest.mark.parametrize("name", ["radau3", "gauss2", "thesis"])
