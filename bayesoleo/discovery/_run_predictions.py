@@ -290,7 +290,8 @@ def _told_by_beginning(fit: ModelFit, problem: CampaignProblem, start: Array) ->
         return None
     predictor = _single(fit, part, problem.predictor.steps, problem.predictor)
     found = _estimate_of(CampaignProblem(predictor).holding(fit.shared), start)
-    return found.theta if found.status.ok else None
+    # It ends on its best point; where that is rough, all of the record is no smoother.
+    return found.theta if found.status in (Status.CONVERGED, Status.NO_CONVERGENCE) else None
 
 
 def crossed(prediction: Prediction) -> Prediction | None:

@@ -28,7 +28,7 @@ from bayesoleo.estimation._least_squares import PriorScale
 from bayesoleo.estimation._problem import measured_of
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._mesh_steps import WHOLE
-from bayesoleo.prediction._periodic_run import PredictedSamples, RunPredictor
+from bayesoleo.prediction._periodic_run import FEW_STEPS, PredictedSamples, RunPredictor
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._run_errors import errors_known, input_columns
@@ -54,6 +54,9 @@ WORTH_COMPILING = 200_000
 #: fifty times as many evaluations. Of an oleo with 11 runs of 128 steps an elastic slider took 6 s
 #: in arrays, and 0.5 s compiled, compilation included.
 WORTH_COMPILING_STATES = 3_000
+#: Motions of one run that are sought by shooting for a score on many steps: each takes seconds to
+#: minutes, and a candidate is scored with ten sets of shapes. Of those not found nothing is seen.
+MOST_SHOTS = 2
 #: Samples of a run kept for comparing candidates with each other, chosen at random: an even choice
 #: would miss what repeats with it.
 MOST_SAMPLES = 1500
@@ -220,6 +223,7 @@ def sensitivities_of(
     found: list[list[Array]] = [[] for _ in shapes]
     for r, run in enumerate(predictor.runs):
         p = _constants(fit, r, run, predictor.constants(theta[None], r), shapes)
+        run.shots = MOST_SHOTS if run.record.periodic and run.steps > FEW_STEPS else None
         derivatives = _of_run(fit, r, run, p)
         if isinstance(derivatives, Status):
             # Steps that do for the present model may be too long for what an effect adds.

@@ -99,6 +99,8 @@ class RunPredictor:
     #: Solutions so far that left the branch of the anchor from which they were started, and whether
     #: they are looked for: where a solution is known, it costs more than the solution.
     jumps, watched = 0, True
+    #: How often a motion may still be sought by shooting; None for any number.
+    shots: int | None = None
 
     def __init__(
         self,
@@ -262,10 +264,11 @@ class RunPredictor:
         # Equations of what lags behind a motion are singular at rest, wherever their answer is.
         if solution.status[0] not in (Status.NO_CONVERGENCE.value, Status.SINGULAR.value):
             return solution
-        if self.anchor is not None and not self.watched:
+        if (self.anchor is not None and not self.watched) or self.shots == 0:
             # A step of an estimate that is only compared: half of it takes less time than shooting
             # through hundreds of cycles of a broadband input.
             return solution
+        self.shots = None if self.shots is None else self.shots - 1
         if self.anchor is not None:
             guess = self.anchor.x[None]  # nearer, so that shooting takes fewer passes
         found = solve_from_shot(self.model, self.kernels, self.record, self.boundary, p, guess)

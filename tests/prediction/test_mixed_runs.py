@@ -267,15 +267,21 @@ def test_a_step_that_is_only_compared_is_not_shot(watched, monkeypatch):
     (run,) = predictor.runs
     run.watched = watched
 
-    def lost(boundary, p, guess):
+    def lost(boundary, p, guess, exchange):
         status = np.array([Status.NO_CONVERGENCE.value])
         return Solution(np.repeat(guess, len(p), axis=0), status, np.zeros(1, dtype=np.int64))
 
     monkeypatch.setattr(periodic_run, "solve_from_guess", lost)
     monkeypatch.setattr(periodic_run, "solve_from_shot", lambda *_: asked.append(1))
-    found = run.solve_from_guess(predictor.constants(theta[None], 0)[0])
+    p = predictor.constants(theta[None], 0)[0]
+    found = run.solve_from_guess(p)
     assert found.status[0] == Status.NO_CONVERGENCE.value
     assert bool(asked) is watched
+    run.anchor, run.shots = None, 2
+    before = len(asked)
+    for _ in range(4):
+        run.solve_from_guess(p)
+    assert len(asked) == before + 2
 
 
 @pytest.mark.parametrize(("lines", "steps"), [(20, 512), (300, 4096)])
