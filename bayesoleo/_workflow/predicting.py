@@ -2,7 +2,8 @@
 
 Unknowns come as draws: of the posterior where the result holds one, else of the normal distribution
 about the estimate. What the result does not know, such as a by-run parameter of a new run, is drawn
-from its prior. Noise of a sample is added to the interval.
+from its prior; where a transient starts, its own record says. Noise of a sample is added to the
+interval.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from scipy import stats
 from bayesoleo import _schema as schema
 from bayesoleo._schema import LabelledResult, columns, variable
 from bayesoleo._types import Array, Float
+from bayesoleo._workflow.predicted_starts import drawn_starts, estimated_starts, unknown_starts
 from bayesoleo._workflow.simulating import model_of, parameter_sets, same_noise, same_samples
 from bayesoleo.assessment._residual_breakdown import judged_errors
 from bayesoleo.assessment._residual_tests import PredictiveScore, score_draws
@@ -278,6 +280,11 @@ def _one_run(
             for n, prior in zip(names, priors, strict=True)
         ]
     )
+    starts = unknown_starts(predictor, known.values)
+    if starts.size and not record.periodic:
+        theta = estimated_starts(predictor, theta, starts)
+        sd = np.array([float(np.mean(_sd_of(name, known, record))) for name in predictor.outputs])
+        table[:, starts] = drawn_starts(predictor, theta, starts, table, sd, rng)
     found = predictor.simulate(table, 0)
     good = found.status == Status.CONVERGED.value
     if good.sum() < 2:

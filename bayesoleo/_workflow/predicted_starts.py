@@ -1,0 +1,134 @@
+"""Where a transient that is predicted starts: its record says so, and no prior knows it better.
+
+The start is estimated on the record, all else held at the estimate. About it the solution is taken
+as linear: each draw of the other unknowns then has a start of its own, which fits the record as
+well as it can, and what noise leaves open of it is drawn (the conditional normal distribution of a
+linear model; Bishop 2006, Pattern Recognition and Machine Learning, section 3.3.1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+
+from bayesoleo._types import Array, Integers
+from bayesoleo.discovery._beginnings import beginning_of
+from bayesoleo.discovery._fit import weights
+from bayesoleo.estimation._campaign_problem import CampaignProblem
+from bayesoleo.estimation._estimate import estimate
+from bayesoleo.model._drive_and_start import start_parameters
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.solvers._orbit import Status
+
+#: Of an estimate of starts: a prediction asks for no certified digits.
+LIMITS = {"tolerance": 1e-4, "max_iterations": 30, "resolution": 1e-2}
+
+
+def unknown_starts(predictor: Predictor, known: Collection[str]) -> Integers:
+    """Columns of one run's unknowns that say where it starts, and that a result does not know.
+
+    Parameters
+    ----------
+    predictor : Predictor
+        Of one run.
+    known : collection of str
+        Unknowns of the result.
+    """
+    layout, starts = predictor.layout, start_parameters(predictor.model)
+    owners = zip(layout.names, layout.parameters, strict=True)
+    found = [k for k, (name, owner) in enumerate(owners) if owner in starts and name not in known]
+    return np.array(found, dtype=np.int64)
+
+
+def estimated_starts(predictor: Predictor, theta: Array, starts: Integers) -> Array:
+    """Unknowns of one run with starts as its record says, shape (l,).
+
+    Parameters
+    ----------
+    predictor : Predictor
+        Of one run.
+    theta : ndarray, shape (l,)
+        All unknowns; those that are not starts are held.
+    starts : ndarray of int
+        Columns of the starts.
+
+    Returns
+    -------
+    ndarray, shape (l,)
+        As given, where the record cannot say.
+    """
+    names = predictor.layout.names
+    held = {n: float(v) for k, (n, v) in enumerate(zip(names, theta, strict=True))
+            if k not in starts}  # fmt: skip
+    problem = CampaignProblem(predictor).holding(held)
+    evaluation = problem.evaluate(theta[starts])
+    if not evaluation.status.ok:
+        return theta
+    (run,) = predictor.runs
+    part = beginning_of(run.record, evaluation)
+    if part is not None:
+        shorter = Predictor(
+            predictor.model, [part], steps=predictor.steps, scheme=predictor.scheme,
+            solver=predictor.solver, backend=predictor.backend, jobs=predictor.jobs,
+            share=predictor,
+        )  # fmt: skip
+        problem = CampaignProblem(shorter).holding(held)
+    measured = problem.nuisances.intersection(problem.names)
+    method = "be" if measured else "mbe"
+    found = estimate(problem, method, start=theta[starts], **LIMITS)  # type: ignore[arg-type]
+    usable = found.status in (Status.CONVERGED, Status.NO_CONVERGENCE)
+    return np.asarray(problem.full(found.theta[None])[0]) if usable else theta
+
+
+def drawn_starts(
+    predictor: Predictor,
+    theta: Array,
+    starts: Integers,
+    draws: Array,
+    noise: Array,
+    rng: np.random.Generator,
+) -> Array:
+    """Starts that go with draws of the other unknowns, shape (m, starts).
+
+    Parameters
+    ----------
+    predictor : Predictor
+        Of one run.
+    theta : ndarray, shape (l,)
+        With the estimated starts.
+    starts : ndarray of int
+        Their columns.
+    draws : ndarray, shape (m, l)
+        Of all unknowns; those of the starts are not read.
+    noise : ndarray, shape (ny,)
+        Standard deviation of each output's errors; where the record is fitted worse, that of what
+        is left counts.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    ndarray, shape (m, starts)
+        The priors' own draws, where nothing can be solved at ``theta``.
+    """
+    (found,) = predictor.evaluate(theta)
+    if not found.status.ok:
+        return np.asarray(draws[:, starts])
+    (run,) = predictor.runs
+    counts = weights(run.record) > 0
+    left = np.sqrt(np.mean((run.measured - found.y)[:, counts] ** 2, axis=1))
+    size = np.maximum(np.maximum(noise, left), 1e-300)
+    rows = found.sensitivity[:, :, counts] / size[:, None, None]
+    by_start = np.concatenate(list(rows[:, starts]), axis=1).T
+    others = np.setdiff1d(np.arange(theta.size), starts)
+    by_other = np.concatenate(list(rows[:, others]), axis=1).T
+    priors = predictor.layout.priors(predictor.model)
+    width = np.array([float(priors[k].sd) for k in starts])
+    # In units of the priors' standard deviations, which are some of any size.
+    scaled = by_start * width
+    precision = scaled.T @ scaled + np.eye(starts.size)
+    moved = (draws[:, others] - theta[others]) @ by_other.T @ scaled
+    centre = -np.linalg.solve(precision, moved.T)
+    root = np.linalg.cholesky(precision)
+    free = np.linalg.solve(root.T, rng.standard_normal((starts.size, len(draws))))
+    return np.asarray(theta[starts] + width * (centre + free).T)
