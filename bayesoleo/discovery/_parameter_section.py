@@ -358,6 +358,8 @@ def _heaviest(known: GivenStructure) -> list[Cell]:
     if len(cells) == 1:
         return cells
     logs = np.array([logsumexp([log for log, _, _ in known.each([cell])]) for cell in cells])
+    if not np.isfinite(logs).any():
+        return cells[:1]  # data want a sign of an effect that physics forbids, whatever its size
     weight = np.exp(logs - logsumexp(logs))
     order = np.argsort(-weight)
     enough = 1 + int(np.searchsorted(np.cumsum(weight[order]), PART))

@@ -436,8 +436,18 @@ class GivenStructure:
         cells : sequence of Cell
         power : ndarray, shape (l,)
             Of the coordinates in which outputs are linear.
+
+        Returns
+        -------
+        float
+            Minus infinity where data want a sign of an effect that physics forbids; the moments
+            are not numbers then.
+        ndarray, ndarray
         """
         found = list(self.each(cells))
+        if not found:
+            nothing = np.full(len(self.names), np.nan)
+            return -np.inf, nothing, nothing
         logs = np.array([log for log, _, _ in found])
         _, mean, covariance = found[int(np.argmax(logs))]
         total, sd = float(logsumexp(logs)), np.sqrt(np.maximum(np.diag(covariance), 0.0))

@@ -8,6 +8,7 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from bayesoleo.discovery._limited_parameters import Coordinates
+from bayesoleo.discovery._parameter_section import _heaviest
 from bayesoleo.discovery._structure_columns import Group, Likelihood
 from bayesoleo.discovery._structure_parameters import LIGHTEST, GivenStructure
 from bayesoleo.model import Normal
@@ -92,6 +93,26 @@ def test_intervals_cover_where_data_say_little_of_the_structure():
         inside += found.low < theta < found.high
     # Three standard errors of a proportion of 0.9.
     assert inside / draws == pytest.approx(0.9, abs=3 * np.sqrt(0.09 / draws))
+
+
+@pytest.mark.parametrize("size", [3.0, 3e3, 1e9])
+def test_a_sign_that_physics_forbids_has_no_evidence(size):
+    """The more the data want it, the less there is; in the end none, which is no error."""
+    rows = columns(0.3, 1, 3)
+    noise = np.random.default_rng(4).standard_normal(SAMPLES)
+    wanted, forbidden = (
+        of_residual(sign * size * rows[1] + noise, rows, (1.0,)) for sign in (1.0, -1.0)
+    )
+    power, cells = np.ones(1), _heaviest(wanted)
+    assert np.isfinite(wanted.log_evidence(cells, power)[0])
+    cells = _heaviest(forbidden)
+    assert len(cells) >= 1
+    log, mean, sd = forbidden.log_evidence(cells, power)
+    assert log < wanted.log_evidence(cells, power)[0] - 10.0
+    assert mean.shape == sd.shape == (1,)
+    if size > 1e3:
+        assert log == -np.inf
+        assert np.isnan(mean).all()
 
 
 @pytest.mark.parametrize("size", [0.0, 1.0, 30.0, 3000.0])
