@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Flags
 from bayesoleo.prediction._records import Harmonics
 
 #: A channel changes in steps if changes that exceed the median by such a factor hold so large a
@@ -95,7 +95,7 @@ def count_steps(values: Array) -> int:
     return int(np.count_nonzero(large)) if alone and whole and flat else 0
 
 
-def _variance_between(values: Array, steps: Array) -> float:
+def _variance_between(values: Array, steps: Flags) -> float:
     """Variance of a channel about its mean from each step to the next."""
     place = np.concatenate([[0], np.cumsum(steps)])
     mean = np.bincount(place, values) / np.bincount(place)
