@@ -404,6 +404,14 @@ def frequency_warnings(records: Sequence[Record]) -> list[str]:
 
 def _about_period(record: Record) -> list[str]:
     """Warnings about the period of one run."""
+    count, channel = periods_per_motion(record)
+    if count > 1:
+        # Harmonics are then a part of the motion's: of how often it repeats they say nothing.
+        return [
+            f"run {record.label}: {channel} repeats only after {count} declared periods, and the "
+            f"difference between these counts as noise; write frequency = "
+            f"{record.frequency / count:.4g}"
+        ]
     found = []
     times = motions_per_period(record)
     if times > 1:
@@ -411,14 +419,6 @@ def _about_period(record: Record) -> list[str]:
             f"run {record.label}: the motion repeats {times} times in a declared period, as if "
             f"that were {times} periods; write frequency = {times * record.frequency:.4g}"
         )
-    count, channel = periods_per_motion(record)
-    if count > 1:
-        found.append(
-            f"run {record.label}: {channel} repeats only after {count} declared periods, and the "
-            f"difference between these counts as noise; write frequency = "
-            f"{record.frequency / count:.4g}"
-        )
-        return found
     return found + [
         f"run {record.label}: nothing in {name} repeats at {record.frequency:.4g} Hz above its "
         "noise; look at the record, leave the run out, or declare it as kind = 'transient'"

@@ -17,7 +17,11 @@ from bayesoleo.data import (
     reduce_campaign,
     write_campaign,
 )
-from bayesoleo.data._data_warnings import motions_per_period, periods_per_motion
+from bayesoleo.data._data_warnings import (
+    frequency_warnings,
+    motions_per_period,
+    periods_per_motion,
+)
 from bayesoleo.errors import InputError
 
 PER_PERIOD, PERIODS = 200.37, 6
@@ -127,6 +131,22 @@ def test_a_part_of_the_frequency_is_found_out_under_noise(tmp_path, part):
     for noise in (0.3, 1.0):
         (record,) = reduced(tmp_path / f"{noise}", noisy, FREQUENCY / part, noise=noise).records
         assert motions_per_period(record) == part
+
+
+def test_advice_on_a_frequency_does_not_contradict_itself(tmp_path):
+    """Of a motion with half the declared frequency and four times it, one sentence is right."""
+
+    def both(cycles):
+        return np.sin(2 * np.pi * 4 * cycles) + 0.4 * np.sin(2 * np.pi * 0.5 * cycles)
+
+    def build(rng):
+        return both(FREQUENCY * TIME) + 0.02 * rng.standard_normal(TIME.size)
+
+    (record,) = reduced(tmp_path, build, force=both, noise=0.02).records
+    assert motions_per_period(record) == 4
+    (sentence,) = frequency_warnings([record])
+    assert "repeats only after 2 declared periods" in sentence
+    assert sentence.endswith(f"write frequency = {FREQUENCY / 2:.4g}")
 
 
 def test_twice_the_frequency_does_not_repeat(tmp_path):
