@@ -1,4 +1,4 @@
-"""Where a transient that is predicted starts: its record says so, and no prior knows it better.
+"""Where a transient that is predicted starts, by its record and by the prior of its start.
 
 The start is estimated on the record, all else held at the estimate. About it the solution is taken
 as linear: each draw of the other unknowns then has a start of its own, which fits the record as
@@ -23,6 +23,8 @@ from bayesoleo.solvers._orbit import Status
 
 #: Of an estimate of starts: a prediction asks for no certified digits.
 LIMITS = {"tolerance": 1e-4, "max_iterations": 30, "resolution": 1e-2}
+#: How often a start beyond its prior's limits is drawn anew, before it is the estimate.
+REDRAWN = 50
 
 
 def unknown_starts(predictor: Predictor, known: Collection[str]) -> Integers:
@@ -74,9 +76,8 @@ def estimated_starts(predictor: Predictor, theta: Array, starts: Integers) -> Ar
             share=predictor,
         )  # fmt: skip
         problem = CampaignProblem(shorter).holding(held)
-    measured = problem.nuisances.intersection(problem.names)
-    method = "be" if measured else "mbe"
-    found = estimate(problem, method, start=theta[starts], **LIMITS)  # type: ignore[arg-type]
+    # A declared height of fall may be known better than its record tells it.
+    found = estimate(problem, "be", start=theta[starts], **LIMITS)  # type: ignore[arg-type]
     usable = found.status in (Status.CONVERGED, Status.NO_CONVERGENCE)
     return np.asarray(problem.full(found.theta[None])[0]) if usable else theta
 
@@ -130,5 +131,18 @@ def drawn_starts(
     moved = (draws[:, others] - theta[others]) @ by_other.T @ scaled
     centre = -np.linalg.solve(precision, moved.T)
     root = np.linalg.cholesky(precision)
-    free = np.linalg.solve(root.T, rng.standard_normal((starts.size, len(draws))))
-    return np.asarray(theta[starts] + width * (centre + free).T)
+
+    def drawn(rows: Integers) -> Array:
+        free = np.linalg.solve(root.T, rng.standard_normal((starts.size, rows.size)))
+        return np.asarray(theta[starts] + width * (centre[:, rows] + free).T)
+
+    found_starts = drawn(np.arange(len(draws)))
+    low, high = np.array([priors[k].support for k in starts], dtype=float).T
+    for _ in range(REDRAWN):
+        outside = np.flatnonzero(((found_starts <= low) | (found_starts >= high)).any(axis=1))
+        if not outside.size:
+            break
+        found_starts[outside] = drawn(outside)
+    else:
+        found_starts[outside] = theta[starts]
+    return found_starts

@@ -41,6 +41,7 @@ from bayesoleo.estimation._baselines import (
     with_common_baselines,
 )
 from bayesoleo.estimation._nuisance import uncertain_conditions
+from bayesoleo.model._drive_and_start import with_estimated_starts
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._input_bandwidth import without_invented
 from bayesoleo.prediction._mesh_steps import MOST_STEPS, first_steps
@@ -168,6 +169,9 @@ def predict(
         check_baselines(added, used)
         chosen = with_common_baselines(chosen, added, partial(same_noise, tree))
     records = uncertain_conditions(used).complete(chosen)
+    if not all(record.periodic for record in records):
+        # A result of periodic runs alone knows nothing of starts.
+        used = with_estimated_starts(used)
     found = [
         _one_run(used, record, known, rng, level, scheme, solver, steps, jobs) for record in records
     ]

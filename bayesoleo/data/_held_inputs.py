@@ -18,9 +18,11 @@ from bayesoleo.prediction._records import Harmonics
 #: part of all squares beyond the noise's, and so many of them stand alone: those of a pulse are
 #: neighbours.
 _FACTOR, _CHANGES, _ALONE = 10.0, 0.9, 0.5
-#: Part of a channel's variance that may be left between its steps, beside the noise (in variances):
-#: a force that jumps as friction turns goes on between its jumps.
-_BETWEEN, _BESIDE_NOISE = 0.01, 2.0
+#: A change of so many standard deviations begins another level. A force that jumps where friction
+#: turns goes on between its jumps; about the levels of a command there is its noise, and what steps
+#: below that size make of it, alike within: ``1 + 2 LEVEL**2 / 12`` variances of the noise.
+_LEVEL = 4.0
+_ABOUT_LEVELS = 1.0 + _LEVEL**2 / 6.0
 #: Part of the swing below which a smallest change may be a converter's digit.
 _DIGIT = 0.05
 #: Median of the absolute value of a normal variate.
@@ -87,11 +89,12 @@ def count_steps(values: Array) -> int:
         return 0
     beside = np.convolve(large, [1, 0, 1], mode="same") > 0
     alone = np.count_nonzero(large & ~beside) >= _ALONE * np.count_nonzero(large)
+    # Two neighbours' noise stands in a change.
     noise = (median / _NORMAL) ** 2
     whole = np.sum(changes[large] ** 2) >= _CHANGES * (np.sum(changes**2) - changes.size * noise)
-    # Two neighbours' noise stands in a change.
-    most = _BETWEEN * np.var(values) + _BESIDE_NOISE * noise / 2.0
-    flat = _variance_between(values, large) <= most
+    levels = changes > _LEVEL * np.sqrt(noise)
+    least = (1e-6 * np.ptp(values)) ** 2  # of a command without noise, digits
+    flat = _variance_between(values, levels) <= _ABOUT_LEVELS * noise / 2.0 + least
     return int(np.count_nonzero(large)) if alone and whole and flat else 0
 
 

@@ -342,4 +342,5 @@ def _own_estimate(prediction: Prediction, record: Record) -> Array | None:
     problem = CampaignProblem(predictor).holding(shared)
     start = np.array([prediction.theta[name] for name in problem.names])
     point = _estimate_of(problem, start)
-    return problem.full(point.theta[None])[0] if point.status.ok else None
+    usable = point.status in (Status.CONVERGED, Status.NO_CONVERGENCE)
+    return problem.full(point.theta[None])[0] if usable else None

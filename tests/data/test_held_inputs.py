@@ -167,3 +167,21 @@ def test_jumps_of_a_course_that_goes_on_are_no_steps(jump, noise):
         angle = 2 * np.pi * cycles * time
         values = np.sin(angle) + jump * np.sign(np.cos(angle))
         assert count_steps(values + noise * rng.standard_normal(time.size)) == 0
+
+
+@pytest.mark.parametrize("length", [5, 20, 100])
+@pytest.mark.parametrize("noise", [0.02, 0.05])
+@pytest.mark.parametrize("levels", ["normal", "uniform", "two"])
+def test_steps_of_any_height_are_seen_beside_noise(length, noise, levels):
+    """Small steps drown in it, and levels on both sides are taken for one."""
+    seen = 0
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        count = 4000 // length
+        heights = {
+            "normal": rng.standard_normal(count),
+            "uniform": rng.uniform(-1.7, 1.7, count),
+            "two": rng.choice([-1.0, 1.0], count),
+        }[levels]
+        seen += count_steps(np.repeat(heights, length) + noise * rng.standard_normal(4000)) > 0
+    assert seen >= 8

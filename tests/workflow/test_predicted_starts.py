@@ -7,10 +7,13 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import bayesoleo._workflow as workflow
+from bayesoleo._workflow.predicted_starts import drawn_starts, estimated_starts, unknown_starts
 from bayesoleo._workflow.predicting import predict
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.data import load_campaign, reduce_campaign
 from bayesoleo.model import Dof, Model, Output, Parameter
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._records import transient_record
 
 NOISE, STEP, COUNT = 2e-3, 0.01, 3000
 SETTINGS = Settings(jobs=1, steps=128)
@@ -137,3 +140,84 @@ def test_starts_that_noise_leaves_open_are_drawn(tmp_path):
     half = 0.5 * float((found["high"] - found["low"])[0, 0, 0])
     # Of 4000 draws a deviation is known to 1.1 %; that of the noise to 0.9 %.
     assert half == pytest.approx(1.959964 * np.sqrt(variance), rel=0.05)
+
+
+def test_a_result_of_periodic_runs_has_no_starts_and_needs_none(tmp_path):
+    """Of two masses one is not seen: neither its place nor its rate are in any record."""
+    campaign = reduced(tmp_path, "two")
+    rng, time = np.random.default_rng(3), STEP * np.arange(COUNT)
+    step = 2 * np.pi / 2.5
+    found = solve_ivp(
+        lambda t, s: TRUTHS["two"][1](s, np.sin(step * t)), (0.0, 60.0 + time[-1]), np.zeros(4),
+        t_eval=60.0 + time, rtol=1e-9, atol=1e-10,
+    )  # fmt: skip
+    y = found.y[0] + NOISE * rng.standard_normal(COUNT)
+    table = np.column_stack([time, np.sin(step * (60.0 + time)), y])
+    np.savetxt(tmp_path / "p.csv", table, delimiter=",", header="time,u,y", comments="")
+    text = (tmp_path / "campaign.toml").read_text()
+    cycle = f'[[runs]]\nlabel = "p"\nfile = "p.csv"\nfrequency = {1 / 2.5!r}\n'
+    periodic = tmp_path / "periodic"
+    periodic.mkdir()
+    (tmp_path / "p.csv").rename(periodic / "p.csv")
+    (periodic / "campaign.toml").write_text(text[: text.index("[[runs]]")] + cycle)
+    tree = workflow.estimate(reduce_campaign(load_campaign(periodic), jobs=1), two(), SETTINGS)
+    assert not any("start" in str(name) for name in tree["point"]["parameter"].values)
+    forecast = predict(tree, campaign, runs=["c", "d"], jobs=1)
+    # One period of a sine leaves more open of the parameters than two records that ring down.
+    assert (forecast["rms"] < 1.4 * NOISE).all()
+    np.testing.assert_allclose(forecast["rms"], forecast["expected_rms"], rtol=0.2)
+    np.testing.assert_allclose(forecast["coverage"], 0.95, atol=0.04)
+
+
+def released(height: float, sd: float, **kinds) -> Model:
+    """Let go at a height that every run knows to a tolerance."""
+    return Model(
+        "released",
+        inputs={"u": ""},
+        dofs={"x": Dof("", initial="h", initial_rate="0")},
+        parameters={
+            "c": Parameter(2.0, "", relative_sd=0.01),
+            "k": Parameter(32.0, "", relative_sd=0.01),
+            "h": Parameter(height, "", sd=sd, by_run=True, **kinds),
+        },
+        equations={"x": "ddot(x) + c*dot(x) + k*x - 1*u"},
+        outputs={"y": Output("x", "")},
+    )
+
+
+def drawn_for(model: Model, height: float, noise: float, seed: int) -> np.ndarray:
+    """Starts drawn for a run, all else being known."""
+    rng, time = np.random.default_rng(seed), STEP * np.arange(400)
+    found = solve_ivp(
+        lambda t, s: [s[1], -2.0 * s[1] - 32.0 * s[0]], (0.0, time[-1]), [height, 0.0],
+        t_eval=time, rtol=1e-9, atol=1e-12,
+    )  # fmt: skip
+    y = found.y[0] + noise * rng.standard_normal(time.size)
+    record = transient_record("r", time, {"u": 1e-9 * np.sin(time), "y": y})
+    predictor = Predictor(model, [record], steps=256, backend="numpy", jobs=1)
+    theta = predictor.layout.start(model)
+    predictor.set_anchor(theta)
+    starts = unknown_starts(predictor, {"c", "k"})
+    theta = estimated_starts(predictor, theta, starts)
+    draws = np.repeat(theta[None], 400, axis=0)
+    return drawn_starts(predictor, theta, starts, draws, np.array([noise]), rng)[:, 0]
+
+
+@pytest.mark.parametrize("sd", [0.1, 0.005, 0.002])
+def test_a_start_is_known_by_its_record_and_by_its_prior(sd):
+    """Truths drawn from the prior, which is worse than the record, as good, and better."""
+    scores = []
+    for seed in range(40):
+        height = 0.02 + sd * np.random.default_rng([seed, 1]).standard_normal()
+        found = drawn_for(released(0.02, sd), height, 0.03, seed)
+        scores.append((height - found.mean()) / found.std())
+    # Forty standard normal scores: within three standard errors of one.
+    assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1.0, abs=3 / np.sqrt(80))
+
+
+def test_no_start_beyond_its_limits_is_drawn():
+    """A height close to zero, which may not be below."""
+    found = drawn_for(released(0.02, 0.02, bounds=(0.0, 1.0)), 5e-4, 0.005, 0)
+    assert found.min() > 0.0
+    assert found.max() < 0.02
+    assert np.unique(found).size > 300
