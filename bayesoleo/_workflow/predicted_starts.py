@@ -136,13 +136,15 @@ def drawn_starts(
         free = np.linalg.solve(root.T, rng.standard_normal((starts.size, rows.size)))
         return np.asarray(theta[starts] + width * (centre[:, rows] + free).T)
 
-    found_starts = drawn(np.arange(len(draws)))
+    chosen = drawn(np.arange(len(draws)))
     low, high = np.array([priors[k].support for k in starts], dtype=float).T
+
+    def outside() -> Integers:
+        return np.flatnonzero(((chosen <= low) | (chosen >= high)).any(axis=1))
+
     for _ in range(REDRAWN):
-        outside = np.flatnonzero(((found_starts <= low) | (found_starts >= high)).any(axis=1))
-        if not outside.size:
+        if not (again := outside()).size:
             break
-        found_starts[outside] = drawn(outside)
-    else:
-        found_starts[outside] = theta[starts]
-    return found_starts
+        chosen[again] = drawn(again)
+    chosen[outside()] = theta[starts]
+    return chosen
