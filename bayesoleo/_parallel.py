@@ -173,6 +173,9 @@ ROUNDS = 3
 PATIENCE = 10
 #: Seconds to wait for a worker where a cluster has none: those that were killed begin again.
 WAIT = 300
+#: What calls of a client raise while its scheduler is being lost; the last kind once its pool of
+#: connections is closed.
+UNCONNECTED = (OSError, CancelledError, RuntimeError)
 
 #: State of one worker pool on a worker: its token and its function.
 _kept: dict[str, Callable[[Any], Any]] = {}
@@ -312,7 +315,7 @@ class WorkerPool:
     @property
     def size(self) -> int:
         """Threads of all workers together, at least one."""
-        with suppress(OSError):  # the scheduler is being lost, as the next task will tell
+        with suppress(*UNCONNECTED):  # the scheduler is being lost, as the next task will tell
             return int(max(sum(self.client.nthreads().values()), 1))
         return 1
 
@@ -356,10 +359,14 @@ class WorkerPool:
     def _submit(self, missing: dict[int, Any]) -> dict[Any, int]:
         self._check_scheduler()
         self._share()
-        return {
-            self.client.submit(_call, self._token, self._shared, item, pure=False): index
-            for index, item in missing.items()
-        }
+        try:
+            return {
+                self.client.submit(_call, self._token, self._shared, item, pure=False): index
+                for index, item in missing.items()
+            }
+        except Exception:  # Dask's own kind, where a client closes meanwhile
+            self._check_scheduler()
+            raise
 
     def _share(self) -> None:
         """Send the function to all workers, as soon as there is one."""
@@ -369,7 +376,7 @@ class WorkerPool:
                 self._shared = self.client.scatter([self._payload], broadcast=True, hash=False)[0]
             # There is no worker, or the last one is lost while it is sent to: Dask then finds an
             # unknown address or nothing to copy to. A client that is closed has no scheduler.
-            except (OSError, KeyError, ValueError, AttributeError) as error:
+            except (*UNCONNECTED, KeyError, ValueError, AttributeError) as error:
                 self._check_scheduler()
                 if time.monotonic() > deadline:
                     raise ResultsError(
@@ -614,7 +621,7 @@ class Machines:
             return 0
         now = time.monotonic()
         if now - self._counted > self.COUNTED:
-            with suppress(OSError):  # the scheduler is being lost
+            with suppress(*UNCONNECTED):  # the scheduler is being lost
                 self._size = max(sum(self.client.nthreads().values()), 1)
             self._counted = now
         return self._size
@@ -630,7 +637,7 @@ class Machines:
     def close(self) -> None:
         """Cancel what is not done; its processes end."""
         if self.client.status == "running":
-            with suppress(OSError):
+            with suppress(*UNCONNECTED):
                 self.client.cancel([one for one in self._begun if not one.done()])
 
 

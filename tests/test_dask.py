@@ -104,16 +104,21 @@ def test_two_writers_of_pieces_are_refused(tmp_path):
 class Cluster:
     """As a client is seen by a pool: without workers at first, or with its scheduler lost."""
 
-    def __init__(self, *problems, status="running"):
-        self.problems, self.status = list(problems), status
+    def __init__(self, *problems, loses=False):
+        self.problems, self.loses, self.status = list(problems), loses, "running"
 
     def scatter(self, payloads, **_):
         if self.problems:
+            self.status = "closed" if self.loses else self.status
             raise self.problems.pop(0)
         return payloads
 
     def submit(self, *_, **__):
         return "sent"
+
+    def closing(self, *_, **__):
+        self.status = "closed" if self.loses else self.status
+        raise LookupError("an error of Dask's own")
 
 
 def test_a_cluster_without_workers_is_waited_for():
@@ -131,8 +136,25 @@ def test_workers_that_never_come_are_an_error(monkeypatch):
 
 
 def test_a_lost_scheduler_is_not_waited_for():
+    # The second is what Dask raises where the client closes between the look at it and the call.
+    for problem in (OSError(), RuntimeError("ConnectionPool is closed")):
+        cluster = Cluster(problem, loses=True)
+        with pytest.raises(ResultsError, match="scheduler was lost"):
+            WorkerPool(cluster, failing)._submit({5: 1})
+
+
+def test_a_scheduler_lost_while_tasks_are_sent_is_named():
+    cluster = Cluster(loses=True)
+    cluster.submit = cluster.closing
     with pytest.raises(ResultsError, match="scheduler was lost"):
-        WorkerPool(Cluster(OSError(), status="closed"), failing)._submit({5: 1})
+        WorkerPool(cluster, failing)._submit({5: 1})
+
+
+def test_other_errors_of_sending_are_raised_as_they_are():
+    cluster = Cluster()
+    cluster.submit = cluster.closing
+    with pytest.raises(LookupError):
+        WorkerPool(cluster, failing)._submit({5: 1})
 
 
 @pytest.mark.slow
