@@ -165,6 +165,7 @@ class Commands(TyperGroup):
             user stopped the command.
         """
         try:
+            check_address_space()
             with one_line_warnings():
                 return super().invoke(ctx)
         except (Stopped, KeyboardInterrupt) as stop:
@@ -196,6 +197,31 @@ _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.
 _NO_ROOM = ("failed to map segment", "cannot allocate memory", "cannot map zero-fill")
 
 
+#: Bytes of address space that the numerical libraries take before any work; measured, 0.86 GB.
+LIBRARIES = 900 * 2**20
+
+
+def check_address_space() -> None:
+    """Raise where a limit leaves no room for the libraries: some of them end the process when they
+    meet it, and say nothing that a user can act on.
+
+    Raises
+    ------
+    MemoryError
+        If the limit is too low.
+    """
+    try:
+        import resource
+    except ImportError:  # a system without such limits
+        return
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit < LIBRARIES:
+        raise MemoryError(
+            f"a limit of {limit / 2**20:.0f} MB is set (ulimit -v), and the libraries alone need"
+            f" {LIBRARIES / 2**20:.0f} MB"
+        )
+
+
 def machine_text(error: MemoryError | OSError | ImportError) -> str:
     """What is told where memory or a disk has come to its limit; empty for other errors."""
     if isinstance(error, MemoryError):
@@ -203,6 +229,8 @@ def machine_text(error: MemoryError | OSError | ImportError) -> str:
     if isinstance(error, ImportError):
         full = any(words in str(error).lower() for words in _NO_ROOM)
         return memory_text(MemoryError("a library cannot be loaded")) if full else ""
+    if error.errno == errno.ENOMEM:
+        return memory_text(MemoryError())
     if error.errno not in _DISK:
         return ""
     where = f"file {error.filename}: " if error.filename else ""

@@ -42,6 +42,26 @@ def test_unexpected_exceptions_are_not_hidden(run, monkeypatch, campaign):
     assert isinstance(result.exception, RuntimeError)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no such limit")
+def test_too_small_a_limit_of_memory_is_named_before_libraries_meet_it():
+    """One of them would end the process with a line of its own and status 1."""
+    code = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_AS, (300 * 2**20,) * 2)\n"
+        "from bayesoleo._cli import main; sys.argv = ['bayesoleo', 'systems']; main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: not enough memory: a limit of 300 MB is set")
+    assert done.stderr.count("\n") == 1
+
+
+def test_no_limit_or_a_large_one_is_no_error(monkeypatch):
+    resource = pytest.importorskip("resource")
+    for limit in (resource.RLIM_INFINITY, 2 * shell.LIBRARIES):
+        monkeypatch.setattr(resource, "getrlimit", lambda _, limit=limit: (limit, limit))
+        shell.check_address_space()
+
+
 def test_warning_is_one_line(run, monkeypatch, campaign):
     def warns(*_, **__):
         warnings.warn("noise\nis large", DataWarning, stacklevel=1)
