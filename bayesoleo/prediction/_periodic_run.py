@@ -42,6 +42,10 @@ from bayesoleo.solvers._schemes import scheme
 CHUNK = 8
 #: Steps of a period up to which its factorisation takes some tens of milliseconds.
 FEW_STEPS = 1024
+#: Damped steps of Newton's method from a predicted motion, and undamped ones after them. About an
+#: estimate of friction with clearance, 20 damped ones solve two thirds of the vectors, 40 solve 85
+#: % in half as much time again, and 200 undamped ones leave one in two hundred, in less.
+DAMPED_STEPS, WHOLE_STEPS = 20, 200
 #: Threads share a run.
 _COUNTING = threading.Lock()
 
@@ -284,12 +288,34 @@ class RunPredictor:
         anchor = self.anchor
         assert anchor is not None
         change = p[:, self.active] - anchor.p[self.active]
-        solution = solve_extrapolated(self.boundary, p, anchor.extrapolation, change)
+        solution = solve_extrapolated(
+            self.boundary, p, anchor.extrapolation, change, max_iterations=DAMPED_STEPS
+        )
+        solution = self._undamped(p, solution, change)
         for pieces in PATH_PIECES:
             failed = np.flatnonzero(solution.status != Status.CONVERGED.value)
             for lane in failed:
                 solution = self._along_path(p, solution, int(lane), pieces)
         return solution
+
+    def _undamped(self, p: Array, solution: Solution, change: Array) -> Solution:
+        """Whole steps for lanes in which damped ones are caught between kinks, as of friction with
+        clearance; only a motion near its prediction is taken, as whole steps may reach others."""
+        anchor = self.anchor
+        assert anchor is not None
+        failed = np.flatnonzero(solution.status == Status.NO_CONVERGENCE.value)
+        if not failed.size:
+            return solution
+        start = anchor.predict(change[failed])
+        trial = solve_periodic(
+            self.boundary, p[failed], start, max_iterations=WHOLE_STEPS, monotone=False,
+            overwrite=True, exchange=False,
+        )  # fmt: skip
+        found = trial.status == Status.CONVERGED.value
+        found &= ~anchor.left_by(change[failed], trial.x)
+        x, status = solution.x, solution.status.copy()
+        x[failed[found]], status[failed[found]] = trial.x[found], Status.CONVERGED.value
+        return replace(solution, x=x, status=status)
 
     def _along_path(self, p: Array, solution: Solution, lane: int, pieces: int) -> Solution:
         """Walk from the anchor to one lane's parameters in equal pieces."""

@@ -220,18 +220,24 @@ def solve_periodic(
 
 
 def solve_extrapolated(
-    problem: Boundary, p: Array, extrapolation: Extrapolation, change: Array
+    problem: Boundary,
+    p: Array,
+    extrapolation: Extrapolation,
+    change: Array,
+    *,
+    max_iterations: int = 40,
 ) -> Solution:
     """The same from ``extrapolation.starts(change)``, ``change (L, na)``, without making them."""
-    arranged = problem.arranged
+    arranged, most = problem.arranged, max_iterations
     if arranged is None:
-        return solve_periodic(problem, p, extrapolation.starts(change), overwrite=True)
+        start = extrapolation.starts(change)
+        return solve_periodic(problem, p, start, max_iterations=most, overwrite=True)
     x = np.empty((p.shape[0], *extrapolation.x.shape))
     moved = np.ascontiguousarray(change[:, extrapolation.moving])
     line = arrangement.LinearStart(*extrapolation.swept(arranged.layout), moved)
-    solution = _compiled(problem, arranged, p, x, 40, True, line)
+    solution = _compiled(problem, arranged, p, x, most, True, line)
     return _with_exchange(
-        problem, p, solution, lambda lanes: extrapolation.starts(change[lanes]), 40, True
+        problem, p, solution, lambda lanes: extrapolation.starts(change[lanes]), most, True
     )
 
 
