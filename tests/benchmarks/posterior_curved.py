@@ -2,11 +2,14 @@
 
 Our draws count from the Laplace mixture to the last kept one, theirs from the same modes with the
 adaptation of step size and masses; compiling is left out, and of each peer the best of its
-settings is taken. These densities are formulas, which a peer compiles into its loop: a second of
-CPU time there says how fast the loop is. Where a density solves a campaign, the loop is nothing
-beside it, and effective draws a call of the density count: a peer's call has the gradient too,
-which takes such a solution two to three times as long. ``z`` is the largest difference of a mean from its exact value, in standard
+settings is taken. ``z`` is the largest difference of a mean from its exact value, in standard
 errors, and of a standard deviation likewise.
+
+These densities are formulas, which a peer compiles into its loop: effective draws a second say how
+fast the loop is. Where a density solves a campaign, the loop is nothing beside it, and effective
+draws a call count. A peer's call has the gradient too. Of an oleo's campaign of 14 runs it takes
+five times as long as a density, and 25 times as long as one of the 40 that an ensemble asks for
+together (11, 2.0 and 0.43 ms).
 """
 
 from __future__ import annotations
