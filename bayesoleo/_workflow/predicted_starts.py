@@ -3,7 +3,8 @@
 The start is estimated on the record, all else held at the estimate. About it the solution is taken
 as linear: each draw of the other unknowns then has a start of its own, which fits the record as
 well as it can, and what noise leaves open of it is drawn (the conditional normal distribution of a
-linear model; Bishop 2006, Pattern Recognition and Machine Learning, section 3.3.1).
+linear model; Bishop 2006, Pattern Recognition and Machine Learning, section 3.3.1). Where the noise
+is correlated, a record tells less of it than independent samples would.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from collections.abc import Collection
 import numpy as np
 
 from bayesoleo._types import Array, Integers
-from bayesoleo.discovery._beginnings import beginning_of
+from bayesoleo.discovery._beginnings import UNSEEN, beginning_of
 from bayesoleo.discovery._fit import weights
+from bayesoleo.discovery._transient_variance import RunNoise, coloured_variance
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._estimate import estimate
 from bayesoleo.model._drive_and_start import start_parameters
@@ -117,20 +119,20 @@ def drawn_starts(
         return np.asarray(draws[:, starts])
     (run,) = predictor.runs
     counts = weights(run.record) > 0
-    left = np.sqrt(np.mean((run.measured - found.y)[:, counts] ** 2, axis=1))
-    size = np.maximum(np.maximum(noise, left), 1e-300)
-    rows = found.sensitivity[:, :, counts] / size[:, None, None]
-    by_start = np.concatenate(list(rows[:, starts]), axis=1).T
+    left = np.where(counts, run.measured - found.y, 0.0)
+    rms = np.sqrt(np.mean(left[:, counts] ** 2, axis=1))
+    size = np.maximum(np.maximum(noise, rms), 1e-300)
+    rows = np.where(counts, found.sensitivity / size[:, None, None], 0.0)
     others = np.setdiff1d(np.arange(theta.size), starts)
-    by_other = np.concatenate(list(rows[:, others]), axis=1).T
     priors = predictor.layout.priors(predictor.model)
     width = np.array([float(priors[k].sd) for k in starts])
     # In units of the priors' standard deviations, which are some of any size.
-    scaled = by_start * width
-    precision = scaled.T @ scaled + np.eye(starts.size)
-    moved = (draws[:, others] - theta[others]) @ by_other.T @ scaled
-    centre = -np.linalg.solve(precision, moved.T)
-    root = np.linalg.cholesky(precision)
+    scaled = rows[:, starts] * width[:, None]
+    told = np.einsum("ban,bcn->ac", scaled, scaled)
+    prior = np.eye(starts.size)
+    by_other = np.einsum("bon,ban->oa", rows[:, others], scaled)
+    centre = -np.linalg.solve(told + prior, ((draws[:, others] - theta[others]) @ by_other).T)
+    root = np.linalg.cholesky(_as_coloured(told, scaled, left / size[:, None]) + prior)
 
     def drawn(rows: Integers) -> Array:
         free = np.linalg.solve(root.T, rng.standard_normal((starts.size, rows.size)))
@@ -148,3 +150,20 @@ def drawn_starts(
         chosen[again] = drawn(again)
     chosen[outside()] = theta[starts]
     return chosen
+
+
+def _as_coloured(told: Array, columns: Array, left: Array) -> Array:
+    """Information on the starts, shape (s, s), where what is left is correlated from one sample to
+    the next, or larger where the start shows: as of independent samples it was ``told``.
+
+    Of ``columns (ny, s, N)`` and ``left (ny, N)``, in units of the noise. Along each axis of what
+    is told, the variance of the estimate is that under the spectrum of what is left; more than
+    independent samples tell is never taken.
+    """
+    size, axes = np.linalg.eigh(told)
+    run = RunNoise(left, np.moveaxis(columns, 1, 0), np.linalg.pinv(told, hermitian=True))
+    for k in np.flatnonzero(size > UNSEEN * size[-1]):
+        influence = np.einsum("a,ban->bn", axes[:, k] / size[k], columns)
+        variance, _ = coloured_variance([influence], [run])
+        size[k] = min(size[k], 1.0 / variance) if variance > 0.0 else size[k]
+    return np.asarray((axes * size) @ axes.T)

@@ -43,8 +43,8 @@ CHUNK = 8
 #: Steps of a period up to which its factorisation takes some tens of milliseconds.
 FEW_STEPS = 1024
 #: Damped steps of Newton's method from a predicted motion, and undamped ones after them. Smooth
-#: motions converge in fewer. About an estimate of friction with clearance, 10 damped ones solve half
-#: of the vectors and 40 solve 85 % in 2.6 times as long; 200 undamped ones leave one in two hundred.
+#: motions converge in fewer. About an estimate of friction with clearance, 10 damped ones solve
+#: half of the vectors and 40 solve 85 % in 2.6 times as long; 200 undamped ones leave one in 200.
 DAMPED_STEPS, WHOLE_STEPS = 10, 200
 #: Threads share a run.
 _COUNTING = threading.Lock()
