@@ -14,7 +14,7 @@ from collections.abc import Collection
 import numpy as np
 
 from bayesoleo._types import Array, Integers
-from bayesoleo.discovery._beginnings import UNSEEN, beginning_of
+from bayesoleo.discovery._beginnings import LIMITS, UNSEEN, on_beginning
 from bayesoleo.discovery._fit import weights
 from bayesoleo.discovery._transient_variance import RunNoise, coloured_variance
 from bayesoleo.estimation._campaign_problem import CampaignProblem
@@ -23,8 +23,6 @@ from bayesoleo.model._drive_and_start import start_parameters
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.solvers._orbit import Status
 
-#: Of an estimate of starts: a prediction asks for no certified digits.
-LIMITS = {"tolerance": 1e-4, "max_iterations": 30, "resolution": 1e-2}
 #: How often a start beyond its prior's limits is drawn anew, before it is the estimate.
 REDRAWN = 50
 
@@ -66,18 +64,7 @@ def estimated_starts(predictor: Predictor, theta: Array, starts: Integers) -> Ar
     held = {n: float(v) for k, (n, v) in enumerate(zip(names, theta, strict=True))
             if k not in starts}  # fmt: skip
     problem = CampaignProblem(predictor).holding(held)
-    evaluation = problem.evaluate(theta[starts])
-    if not evaluation.status.ok:
-        return theta
-    (run,) = predictor.runs
-    part = beginning_of(run.record, evaluation)
-    if part is not None:
-        shorter = Predictor(
-            predictor.model, [part], steps=predictor.steps, scheme=predictor.scheme,
-            solver=predictor.solver, backend=predictor.backend, jobs=predictor.jobs,
-            share=predictor,
-        )  # fmt: skip
-        problem = CampaignProblem(shorter).holding(held)
+    problem = on_beginning(problem, held, theta[starts]) or problem
     # A declared height of fall may be known better than its record tells it.
     found = estimate(problem, "be", start=theta[starts], **LIMITS)  # type: ignore[arg-type]
     usable = found.status in (Status.CONVERGED, Status.NO_CONVERGENCE)

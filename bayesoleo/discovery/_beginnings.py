@@ -11,8 +11,10 @@ from dataclasses import replace
 import numpy as np
 
 from bayesoleo._types import Array
-from bayesoleo.discovery._fit import weights
+from bayesoleo.discovery._fit import RESOLUTION, weights
+from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._problem import Evaluation
+from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
 
 #: Part of the information on a start that may be left in the rest of a record; the estimate moves
@@ -23,6 +25,40 @@ UNSEEN = 1e-10
 #: A beginning is worth a solution of its own if it is no longer than this part of the record. It
 #: has a reserve, as a start that moves may change what it is seen by, and never few samples.
 SHORT, RESERVE, FEWEST = 0.25, 1.5, 256
+#: Of estimates of a run's own parameters: its prediction asks for no certified digits, and a rough
+#: model of a long record for no hundred iterations.
+LIMITS = {"tolerance": 1e-4, "max_iterations": 30, "resolution": RESOLUTION}
+
+
+def on_beginning(
+    problem: CampaignProblem, held: dict[str, float], start: Array
+) -> CampaignProblem | None:
+    """The same problem on the part of its transient that tells its unknowns.
+
+    Parameters
+    ----------
+    problem : CampaignProblem
+        Of one run, whose unknowns say where it starts.
+    held : dict of str to float
+        What it holds.
+    start : ndarray, shape (l,)
+        Unknowns at which the part is chosen.
+
+    Returns
+    -------
+    CampaignProblem or None
+        None where most of the record is needed, or nothing can be solved at ``start``.
+    """
+    evaluation, predictor = problem.evaluate(start), problem.predictor
+    (run,) = predictor.runs
+    part = beginning_of(run.record, evaluation) if evaluation.status.ok else None
+    if part is None:
+        return None
+    shorter = Predictor(
+        predictor.model, [part], steps=predictor.steps, scheme=predictor.scheme,
+        solver=predictor.solver, backend=predictor.backend, jobs=predictor.jobs, share=predictor,
+    )  # fmt: skip
+    return CampaignProblem(shorter).holding(held)
 
 
 def beginning_of(record: Record, evaluation: Evaluation) -> Record | None:

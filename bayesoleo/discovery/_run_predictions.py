@@ -23,9 +23,8 @@ from scipy import stats
 from bayesoleo._types import Array, Float
 from bayesoleo.data._noise import innovation_noise
 from bayesoleo.discovery._assembly import RecordNoise, halves
-from bayesoleo.discovery._beginnings import beginning_of
+from bayesoleo.discovery._beginnings import LIMITS, on_beginning
 from bayesoleo.discovery._fit import (
-    RESOLUTION,
     ModelFit,
     changed_squares,
     weights,
@@ -43,9 +42,6 @@ from bayesoleo.solvers._orbit import Status
 
 #: Columns whose overlap says how many independent coefficients a band holds.
 MOST_COLUMNS = 128
-#: Of estimates of a run's own parameters: its prediction asks for no certified digits, and a rough
-#: model of a long record for no hundred iterations.
-LIMITS = {"tolerance": 1e-4, "max_iterations": 30, "resolution": RESOLUTION}
 
 
 def borne_out(
@@ -284,12 +280,10 @@ def _told_by_beginning(fit: ModelFit, problem: CampaignProblem, start: Array) ->
     owners = dict(zip(layout.names, layout.parameters, strict=True))
     if record.periodic or not all(owners[name] in starts for name in problem.names):
         return None
-    evaluation = problem.evaluate(start)
-    part = beginning_of(record, evaluation) if evaluation.status.ok else None
-    if part is None:
+    shorter = on_beginning(problem, fit.shared, start)
+    if shorter is None:
         return None
-    predictor = _single(fit, part, problem.predictor.steps, problem.predictor)
-    found = _estimate_of(CampaignProblem(predictor).holding(fit.shared), start)
+    found = _estimate_of(shorter, start)
     # It ends on its best point; where that is rough, all of the record is no smoother.
     return found.theta if found.status in (Status.CONVERGED, Status.NO_CONVERGENCE) else None
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from broadband_transients import KINDS, record
 
-from bayesoleo.discovery import _run_predictions
+from bayesoleo.discovery import _beginnings
 from bayesoleo.discovery._beginnings import FEWEST, LEFT, RESERVE, beginning_of
 from bayesoleo.discovery._fit import Numerics, fit_model
 from bayesoleo.discovery._run_predictions import predict_held_out
@@ -98,7 +98,7 @@ def test_the_prediction_of_a_hold_out_run_is_the_same(name, monkeypatch):
         found = beginning_of(one, evaluation)
         sizes.append(one.time.size if found is None else found.time.size)
 
-    monkeypatch.setattr(_run_predictions, "beginning_of", noted)
+    monkeypatch.setattr(_beginnings, "beginning_of", noted)
     (whole,) = predict_held_out(fit, [other])
     assert whole.status.ok
     assert short.status.ok
