@@ -42,10 +42,12 @@ from bayesoleo.solvers._schemes import scheme
 CHUNK = 8
 #: Steps of a period up to which its factorisation takes some tens of milliseconds.
 FEW_STEPS = 1024
-#: Damped steps of Newton's method from a predicted motion, and undamped ones after them. Smooth
-#: motions converge in fewer. About an estimate of friction with clearance, 10 damped ones solve
-#: half of the vectors and 40 solve 85 % in 2.6 times as long; 200 undamped ones leave one in 200.
-DAMPED_STEPS, WHOLE_STEPS = 10, 200
+#: Damped steps of Newton's method from a predicted motion, in a first attempt, and undamped ones
+#: after it, before it has as many damped ones as ever: damped steps are caught between the kinks of
+#: friction with clearance. Smooth motions converge in fewer. About an estimate of such friction, 10
+#: damped ones solve half of the vectors and 40 solve 85 % in 2.6 times as long; 200 undamped ones
+#: leave one in 200.
+FEW_STEPS_DAMPED, WHOLE_STEPS, DAMPED_STEPS = 10, 200, 40
 #: Threads share a run.
 _COUNTING = threading.Lock()
 
@@ -288,19 +290,23 @@ class RunPredictor:
         anchor = self.anchor
         assert anchor is not None
         change = p[:, self.active] - anchor.p[self.active]
-        solution = solve_extrapolated(
-            self.boundary, p, anchor.extrapolation, change, max_iterations=DAMPED_STEPS
-        )
-        solution = self._undamped(p, solution, change)
+        extrapolation, compiled = anchor.extrapolation, self.boundary.arranged is not None
+        most = FEW_STEPS_DAMPED if compiled else DAMPED_STEPS
+        solution = solve_extrapolated(self.boundary, p, extrapolation, change, max_iterations=most)
+        if compiled:
+            solution = self._once_more(p, solution, change, undamped=True)
+            solution = self._once_more(p, solution, change, undamped=False)
         for pieces in PATH_PIECES:
             failed = np.flatnonzero(solution.status != Status.CONVERGED.value)
             for lane in failed:
                 solution = self._along_path(p, solution, int(lane), pieces)
         return solution
 
-    def _undamped(self, p: Array, solution: Solution, change: Array) -> Solution:
-        """Whole steps for lanes in which damped ones are caught between kinks, as of friction with
-        clearance; only a motion near its prediction is taken, as whole steps may reach others."""
+    def _once_more(
+        self, p: Array, solution: Solution, change: Array, *, undamped: bool
+    ) -> Solution:
+        """Lanes that have not converged, from their predictions with more steps. Of whole steps,
+        which may reach any motion, only one near its prediction is taken."""
         anchor = self.anchor
         assert anchor is not None
         failed = np.flatnonzero(solution.status == Status.NO_CONVERGENCE.value)
@@ -308,13 +314,16 @@ class RunPredictor:
             return solution
         start = anchor.predict(change[failed])
         trial = solve_periodic(
-            self.boundary, p[failed], start, max_iterations=WHOLE_STEPS, monotone=False,
-            overwrite=True, exchange=False,
+            self.boundary, p[failed], start, overwrite=True,
+            max_iterations=WHOLE_STEPS if undamped else DAMPED_STEPS,
+            monotone=not undamped, exchange=not undamped,
         )  # fmt: skip
         found = trial.status == Status.CONVERGED.value
-        found &= ~anchor.left_by(change[failed], trial.x)
+        if undamped:
+            found &= ~anchor.left_by(change[failed], trial.x)
         x, status = solution.x, solution.status.copy()
-        x[failed[found]], status[failed[found]] = trial.x[found], Status.CONVERGED.value
+        told = found if undamped else np.ones_like(found)
+        x[failed[found]], status[failed[told]] = trial.x[found], trial.status[told]
         return replace(solution, x=x, status=status)
 
     def _along_path(self, p: Array, solution: Solution, lane: int, pieces: int) -> Solution:
