@@ -15,6 +15,7 @@ from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Assembly
 from bayesoleo.discovery._catalogue_mean import linearised_of, shifted
 from bayesoleo.discovery._fit import ModelFit
+from bayesoleo.discovery._noise_of_inputs import NoiseOfInputs
 from bayesoleo.discovery._run_predictions import Prediction
 from bayesoleo.discovery._scanned_columns import Scanned
 from bayesoleo.discovery._signatures import (
@@ -118,7 +119,8 @@ class Inference:
         problem, point = fit.problem, fit.point
         unknowns = None
         if self.error_model == PowerErrors.word:
-            problem.effective = effective_at(problem, point.theta)
+            most = np.asarray(problem.counts) / NoiseOfInputs.of(fit).inflation
+            problem.effective = np.minimum(effective_at(problem, point.theta), most)
         if self.between_runs:
             unknowns = hierarchical(
                 problem, self.between_runs, theta=point.theta, errors=self.error_model
@@ -142,6 +144,10 @@ _FEWEST = 20
 _PLAIN = "the noise is white, and no more than noise is left"
 _COLOURED = "the spectrum of the noise of {} is not flat (p = {:.1g})"
 _LEFT = "more than noise is left: log odds {:.0f} against noise alone"
+_BY_INPUTS = (
+    "power errors, chosen because noise of measured inputs reaches the outputs, and no more than"
+    " noise is left"
+)
 _UNDECIDED = "effects that the data do not tell apart are left: {}"
 #: Probability of a residual by noise alone below which effects of the catalogue are looked for in
 #: it. Of 145 residuals of simulated campaigns that the catalogue explained better than noise, with
@@ -210,6 +216,9 @@ def chosen_for(
     if word == AUTO and not undecided and more_than_noise_p(fit, noise) > LOOKED_FOR:
         word, reason = error_model_by(noise.p_value, lambda _: -np.inf, fit.predictor.outputs)
         return replace(inference, error_model=word, reason=reason)
+    if word == AUTO and not undecided and NoiseOfInputs.of(fit).alone:
+        # Its colour is that of the model's resonances: effects of the catalogue would imitate it.
+        return replace(inference, error_model=PowerErrors.word, reason=_BY_INPUTS)
     found = FittedSignatures.of(
         fit, assembly, noise, effects=effects, held_out=held_out, scanned=scanned, jobs=jobs
     )

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.fft
+from scipy.special import digamma
 
 from bayesoleo._types import Array, Integers
 from bayesoleo.discovery._assembly import Added
@@ -40,6 +41,8 @@ FIRST_COSINES = 300
 PRIOR_LINES = 8.0
 #: Directions of the errors of the inputs that are kept in a run.
 MOST_INPUTS = 40
+#: Lines on either side over which the variance by draws of an input's noise is averaged.
+NEIGHBOURS = 4
 #: Lengths, in cycles, of the squared exponentials whose mean is the spectrum of a smooth remainder.
 SMOOTHNESS = (0.02, 0.05, 0.2)
 
@@ -235,8 +238,8 @@ class SpectralData:
             kept = _principal(moved) if known else moved[:0]
             before, after = sum(sizes[:r]), sum(sizes[r + 1 :])
             rows.append(np.pad(kept, ((0, 0), (before, after))))
-            rest = np.sum(moved**2, axis=0) - np.sum(kept**2, axis=0)
-            variances.append(np.maximum(rest, 0.0))
+            rest = np.maximum(np.sum(moved**2, axis=0) - np.sum(kept**2, axis=0), 0.0)
+            variances.append(rest if known else _of_neighbours(rest, run.size, len(moved)))
         return np.concatenate(rows), np.concatenate(variances)
 
     def smooth(self) -> Array:
@@ -251,6 +254,22 @@ def _principal(rows: Array) -> Array:
     values, vectors = np.linalg.eigh(rows @ rows.T)
     order = np.argsort(-values)[:MOST_INPUTS]
     return np.asarray(vectors[:, order].T @ rows)
+
+
+def _of_neighbours(variance: Array, size: int, draws: int) -> Array:
+    """Variances of a few draws on lines ``(outputs * size,)``, averaged over neighbouring lines.
+
+    A line that some draws happen to miss would count what is left there many times. Logarithms are
+    averaged: beside a resonance the level falls by decades over a few lines.
+    """
+    if not draws or not variance.any():
+        return variance
+    # The logarithm of a variance of n draws lies this much below that of its mean.
+    low = float(digamma(0.5 * draws) - np.log(0.5 * draws))
+    logs = np.log(np.maximum(variance.reshape(-1, size), 1e-12 * variance.max())) - low
+    window = np.ones(min(2 * NEIGHBOURS + 1, size))
+    count = np.convolve(np.ones(size), window, "same")
+    return np.exp([np.convolve(row, window, "same") / count for row in logs]).ravel()
 
 
 @dataclass(frozen=True)

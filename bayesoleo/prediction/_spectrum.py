@@ -43,8 +43,10 @@ _BEYOND_GAP = 4.0
 #: Floors that make a smaller part of the power than this may be cut whatever their shape: three
 #: thousandths of the amplitude.
 NEGLIGIBLE = 1e-5
-#: Ratio of the lower to the upper half of what is cut: a floor of noise is flat.
-_FLAT = 1.2
+#: Ratio of the lower to the upper half of what is cut: a floor of noise is flat, but for so many
+#: standard errors of the two. With two, white noise of 300 samples was called signal in 4 % of
+#: records, and then counted as none; with four in 0.7 %.
+_FLAT, _SCATTER = 1.2, 4.0
 #: A cut this close to half the sampling rate is none.
 _WHOLE = 0.9
 
@@ -159,7 +161,7 @@ class Spectrum:
             return True
         half = rest.size // 2
         lower, upper = np.median(rest[:half]), np.median(rest[half:])
-        margin = _FLAT + 2.0 * np.sqrt(2.0 / (self.averaged * max(half, 1)))
+        margin = _FLAT + _SCATTER * np.sqrt(2.0 / (self.averaged * max(half, 1)))
         return bool(lower < margin * upper)
 
 
