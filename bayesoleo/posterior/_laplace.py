@@ -10,6 +10,7 @@ Below 0.7 sums of weights converge at a practicable rate; above, use
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,8 @@ RADIUS = 3.0
 #: Most Newton steps: where correlated errors take over from independent ones the mode lies tens of
 #: standard deviations away, along a valley that bends.
 ITERATIONS = 200
+#: Eigenvalue of a precision of unit diagonal below which a direction counts as open.
+OPEN = 1e-12
 #: Largest shape of the weights' tail (Vehtari et al. 2024, section 3.2.4).
 LARGEST_SHAPE = 0.7
 
@@ -92,9 +95,26 @@ def gauss_newton_covariance(log_density: LogDensity, phi: Array) -> Array:
     precision = unknowns.precision(block) + chain.T @ information @ chain
     size = len(block)
     covariance = np.zeros((len(phi), len(phi)))
-    covariance[:size, :size] = np.linalg.inv(precision)
+    covariance[:size, :size] = _inverse(precision)
     covariance[size:, size:] = np.diag(errors.scales() ** 2)
     return covariance
+
+
+def _inverse(precision: Array) -> Array:
+    """Inverse of a precision as a covariance, also where that is singular to rounding.
+
+    Directions that data and priors leave open, as two gains of which one answers the other, keep a
+    large variance.
+    """
+    with suppress(np.linalg.LinAlgError):
+        covariance: Array = np.linalg.inv(precision)
+        np.linalg.cholesky(covariance)
+        return covariance
+    unit = np.sqrt(np.abs(np.diag(precision)))
+    unit[~(unit > 0.0)] = 1.0
+    size, axes = np.linalg.eigh(0.5 * (precision + precision.T) / np.outer(unit, unit))
+    size = np.maximum(size, OPEN * max(float(size[-1]), OPEN))
+    return np.asarray((axes / size) @ axes.T / np.outer(unit, unit))
 
 
 def find_mode(log_density: LogDensity, start: Array, *, iterations: int = ITERATIONS) -> Mode:
