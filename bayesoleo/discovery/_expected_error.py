@@ -257,7 +257,11 @@ def _with(
     policy: SearchPolicy,
 ) -> RunError:
     """An entry with its expected error, and what of it is noise."""
-    least = (policy.least_expected * entry.noise) ** 2
+    coefficients = _coefficients(entry, run.inputs[output])
+    # Each unknown absorbs one of them at most; where a matrix is nearly singular, its rounding
+    # would have a few absorb nearly all.
+    left = 1.0 - run.information.shape[0] / coefficients
+    least = max(policy.least_expected**2, left) * entry.noise**2
     square = max(square, least)
     own = max(square - float(np.trace(parameters)), least)
     return replace(
@@ -265,7 +269,7 @@ def _with(
         expected_error=float(np.sqrt(square)),
         parameters=parameters / square,
         own_share=own / square,
-        own_coefficients=_coefficients(entry, run.inputs[output]) * min(own / entry.noise**2, 1.0),
+        own_coefficients=coefficients * min(own / entry.noise**2, 1.0),
     )
 
 

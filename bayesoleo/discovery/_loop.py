@@ -11,7 +11,7 @@ evidence that a cause was found.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +23,7 @@ from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._alternatives import best_of_beam, eliminated
 from bayesoleo.discovery._assembly import Added, Assembly, Roles
 from bayesoleo.discovery._fit import ModelFit, Numerics
-from bayesoleo.discovery._fit_and_hold_out_error import least_noise, limit
+from bayesoleo.discovery._fit_and_hold_out_error import RunError, least_noise, limit
 from bayesoleo.discovery._judged_together import TOGETHER, judged_together
 from bayesoleo.discovery._nonparametric_round import nonparametric_notes, with_nonparametric
 from bayesoleo.discovery._policy import SearchPolicy
@@ -117,13 +117,13 @@ def explained_by_physics(rounds: Sequence[Round], first: State, final: State) ->
 
     The share of an effect is the fall of the excess in the round that added it.
     """
-    added = final.assembly.added
-    whole = max(excess(first), 1e-300)
+    added, unit = final.assembly.added, yardstick(first, final)
+    whole = max(excess(first, unit), 1e-300)
     if all(step.effect.family not in NO_CAUSE for step in final.assembly.steps):
-        return (excess(first) - excess(final)) / whole if added else 0.0
+        return (excess(first, unit) - excess(final, unit)) / whole if added else 0.0
     # A round that replaced an effect begins without that effect.
     return sum(
-        (excess(item.before) - excess(item.after)) / whole
+        (excess(item.before, unit) - excess(item.after, unit)) / whole
         for item in rounds
         if item.after is not None and _is_physics(item, added)
     )
@@ -137,10 +137,29 @@ def _is_physics(item: Round, added: Sequence[Added]) -> bool:
     return found.score.option.candidate.family not in NO_CAUSE
 
 
-def excess(state: State) -> float:
-    """Excess of the squared ratio to the expected error over one, of hold-out runs if any."""
-    table = state.hold_errors if state.hold_errors.entries else state.fit_errors
-    return float(sum(max(entry.ratio_to_expected**2 - 1.0, 0.0) for entry in table.entries))
+def yardstick(*states: State) -> dict[tuple[str, str], float]:
+    """What to measure an excess by: of each run and output the smallest expected error, SI.
+
+    A model whose parameters are open expects any error. By its own measure it would have explained
+    what it has not, as a sensor with a gain of about zero.
+    """
+    least: dict[tuple[str, str], float] = {}
+    for state in states:
+        for entry in _judged(state):
+            key = entry.run, entry.output
+            least[key] = min(entry.expected, least.get(key, np.inf))
+    return least
+
+
+def excess(state: State, unit: Mapping[tuple[str, str], float]) -> float:
+    """Excess of the squared ratio to an expected error over one, of hold-out runs if any."""
+    ratios = [entry.repeating / unit[entry.run, entry.output] for entry in _judged(state)]
+    return float(sum(max(ratio**2 - 1.0, 0.0) for ratio in ratios))
+
+
+def _judged(state: State) -> tuple[RunError, ...]:
+    """Errors of the hold-out runs; where there are none, of the fitted ones."""
+    return (state.hold_errors if state.hold_errors.entries else state.fit_errors).entries
 
 
 @dataclass(frozen=True)

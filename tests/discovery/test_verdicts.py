@@ -12,10 +12,10 @@ from bayesoleo.discovery._loop import certainty_of, explained_by_physics, verdic
 from bayesoleo.discovery._summary import _may_be_absent
 
 
-def state(ratio, *families, floor=1.15, quiet=(), shift=0.05):
+def state(ratio, *families, floor=1.15, quiet=(), shift=0.05, expected=1.0):
     """A model with effects of some families, whose one held-out run has a ratio."""
     steps = [Stub(effect=Stub(id=family, family=family)) for family in families]
-    entries = [Stub(ratio_to_expected=ratio)]
+    entries = [Stub(run="a", output="y", repeating=ratio * expected, expected=expected)]
     return Stub(
         assembly=Stub(steps=steps, added=[(family, "x") for family in families]),
         at_floor=ratio < floor,
@@ -64,6 +64,22 @@ def test_nine_tenths_must_be_explained_by_physics():
         assert verdict_of(*mixed) == schema.UNEXPLAINED
         assert explained_by_physics(*mixed) == pytest.approx((20.0**2 - 13.6**2) / (100.0**2 - 1))
         assert verdict_of(*searched((13.6, "friction"), (10.0, symptom))) == schema.EFFECT_ADDED
+
+
+@pytest.mark.parametrize("expected", [10.0, 300.0])
+def test_a_model_that_expects_any_error_explains_none(expected):
+    """Of 26 mm a gain of about zero left 21, and expected 7.7 where the noise was 0.02."""
+    dead = state(80.0 / expected, "sensor", floor=0.0, expected=expected)
+    rounds = [added("sensor", NONE, dead)]
+    assert verdict_of(rounds, NONE, dead) == schema.UNEXPLAINED
+    assert explained_by_physics(rounds, NONE, dead) == pytest.approx(0.36, abs=0.01)
+
+
+def test_a_declared_model_that_expects_much_is_no_better():
+    vague = state(10.0, expected=10.0)
+    found = state(3.0, "friction")
+    rounds = [added("friction", vague, found)]
+    assert explained_by_physics(rounds, vague, found) == pytest.approx(1 - 8 / 9999)
 
 
 def test_less_error_than_chance_allows_is_no_success():
