@@ -172,8 +172,14 @@ class Refit:
         )
 
     def outdoes(self, other: Score) -> bool:
-        """Whether the effect leaves only noise and clearly beats an effect that was only scored."""
-        mine, its = (one.fall - self.price * one.size for one in (self.score, other))
+        """Whether the effect leaves only noise and clearly beats an effect that was only scored.
+
+        Where nothing but noise is left, the other one cannot explain more, whatever it is scored:
+        an effect with a value for each run contains those that are alike in all, and scores higher
+        wherever outputs are not linear in them. What it costs decides.
+        """
+        own = self.score.fall
+        mine, its = own - self.price * self.size, min(own, other.fall) - self.price * other.size
         # Scored in transients, the other one's inflation holds the level of what it leaves.
         inflation = max(self.inflation, other.inflation if self.noise.colour is None else 1.0)
         return self.reached and mine - its > self.policy.equal_likelihood * inflation

@@ -64,6 +64,14 @@ def test_what_was_only_scored_is_outdone_where_noise_is_left(fall, reached, out)
     assert estimated(200.0, reached=reached).outdoes(estimated(float(fall)).score) == out
 
 
+def test_what_contains_an_effect_is_outdone_by_what_it_costs():
+    """A value for each run scores as high as one for all, and higher where outputs bend."""
+    best = estimated(200.0)
+    assert best.outdoes(estimated(500.0, size=12).score)
+    assert not best.outdoes(estimated(500.0, size=1).score)
+    assert not estimated(200.0, reached=False).outdoes(estimated(500.0, size=12).score)
+
+
 @pytest.mark.parametrize(("contribution", "alike"), [(NEARLY, True), (ACROSS, False)])
 def test_away_from_the_noise_likeness_decides(contribution, alike):
     """There the likelihood of a wrong model is as sure as it is wrong."""
