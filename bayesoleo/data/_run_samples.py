@@ -479,8 +479,9 @@ def _check_gaps(time: Array, spacing: Array, resolution: float, column: str) -> 
     if deviation[row] <= _allowed(usual, resolution):
         return
     if spacing[row] > 1.49 * usual:
+        missing = max(1, round(spacing[row] / usual) - 1)
         raise CampaignError(
-            f"gap of {spacing[row] / usual:.3g} samples at {time[row]:.6g} s",
+            f"gap of {missing} missing sample(s) after {time[row]:.6g} s",
             column=column,
             hint="cut the run there with start or stop",
         )

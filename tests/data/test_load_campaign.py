@@ -125,7 +125,8 @@ BAD_VALUES = [
     (changed(1, slice(60, 62), np.inf), "run a, column x_mm: 2 missing value"),
     (changed(0, 30, 0.1), "run a, column time_s: time does not increase in row 31"),
     (changed(0, 30, np.nan), "run a, column time_s: no time in row 31"),
-    (np.delete(table(), 30, axis=0), "run a, column time_s: gap of 2 samples at 0.58 s"),
+    (np.delete(table(), 30, axis=0), "run a, column time_s: gap of 1 missing sample.* after 0.58"),
+    (np.delete(table(), np.s_[30:61], axis=0), "run a, column time_s: gap of 31 missing sample"),
     (changed(0, 30, 0.607), "run a, column time_s: spacing at .* instead of 0.02 s"),
     (
         changed(2, slice(None), 1.0),
