@@ -343,6 +343,7 @@ def _samples(
     if values.size != size:
         raise CampaignError(f"column has {values.size} samples and time {size}", column=column)
     values = values[part]
+    _check_finite(values, written, column, part.start, away)
     if not np.array_equal(written, time) and is_uneven(written):
         values = resample(written, time, values)
     gap = ~np.isfinite(values)
@@ -374,6 +375,22 @@ def _samples(
             hint="make it a condition of the run, or check the sensor",
         )
     return _frozen(channel.to_si(values))
+
+
+def _check_finite(
+    values: Array, time: Array, column: str, before: int, away: NDArray[np.bool_]
+) -> None:
+    """Raise where a sample that is not masked is infinite: it was written, and is not missing."""
+    found = np.flatnonzero(np.isinf(values) & ~away)
+    if found.size:
+        row = int(found[0])
+        raise CampaignError(
+            f"{found.size} infinite value(s), the first in row {before + row + 1}, at "
+            f"{time[row]:.6g} s",
+            column=column,
+            value=float(values[row]),
+            hint="write what was measured, mask that time, or cut the run there with start or stop",
+        )
 
 
 #: Sizes of numbers whose sixth powers, up and down, are numbers too.
@@ -437,13 +454,18 @@ def uniform_time(time: Array, column: str, before: int = 0) -> Array:
     Raises
     ------
     CampaignError
-        If times are missing, do not increase, leave a gap, or are too coarse for their spacing.
+        If times are missing or infinite, do not increase, leave a gap, or are too coarse for their
+        spacing.
     """
     if time.size < 3:
         raise CampaignError("fewer than three samples", column=column, value=time.size)
     missing = np.flatnonzero(~np.isfinite(time))
     if missing.size:
-        raise CampaignError(f"no time in row {before + missing[0] + 1}", column=column)
+        first = float(time[missing[0]])
+        what, value = ("no", None) if np.isnan(first) else ("infinite", first)
+        raise CampaignError(
+            f"{what} time in row {before + missing[0] + 1}", column=column, value=value
+        )
     spacing = np.diff(time)
     back = np.flatnonzero(spacing <= 0)
     # Time stamps that are rounded more coarsely than the spacing repeat: a message of its own.

@@ -122,7 +122,11 @@ def changed(column, row, value):
 
 BAD_VALUES = [
     (changed(1, 30, np.nan), "run a, column x_mm: 1 missing value.* first at 0.6 s"),
-    (changed(1, slice(60, 62), np.inf), "run a, column x_mm: 2 missing value"),
+    (
+        changed(1, slice(60, 62), np.inf),
+        r"run a, column x_mm: 2 infinite .* row 61, at 1.2 s .got inf.; write",
+    ),
+    (changed(0, 30, np.inf), r"run a, column time_s: infinite time in row 31 .got inf."),
     (changed(0, 30, 0.1), "run a, column time_s: time does not increase in row 31"),
     (changed(0, 30, np.nan), "run a, column time_s: no time in row 31"),
     (np.delete(table(), 30, axis=0), "run a, column time_s: gap of 1 missing sample.* after 0.58"),
