@@ -231,6 +231,7 @@ def _look(
         try:
             table = read_file(path, wanted=(), every=True, progress=progress)
             looks.append(_timed(file, table))
+            notes += [f"column {name} was left out: {why}" for name, why in table.faults.items()]
         except BayesoleoError as error:
             notes.append(f"{file} was left out: {error}")
     if not looks:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -289,12 +289,31 @@ def _time(
     first = next(iter(names.values()))
     if declared.sample_rate is not None:
         return np.arange(_column(table, first).size) / declared.sample_rate, None
-    name = declared.time or _time_column(table, first)
+    name = declared.time or _time_column(table.columns, first)
     if name is not None:
         return _column(table, name) * _seconds(declared, table, name), name
     rate = table.sample_rate.get(first)
     if rate is not None:
         return np.arange(_column(table, first).size) / rate, None
+    damaged = _time_column(table.faults, first)
+    if damaged is not None:
+        raise _or_a_rate(table.faults[damaged])
+    raise CampaignError("no time column", hint=_where_times_are(table))
+
+
+def _or_a_rate(fault: CampaignError) -> CampaignError:
+    """The fault of a time column, which a known sample rate makes dispensable."""
+    return CampaignError(
+        fault.problem,
+        file=fault.file,
+        column=fault.column,
+        value=fault.value,
+        hint=f"{fault.hint}, or give sample_rate",
+    )
+
+
+def _where_times_are(table: FileColumns) -> str:
+    """What to write where no column is known to be time."""
     hint = (
         "it is found by names such as time, time_s, Time [ms] or t; if yours has another, write "
         f"time = '...', or give sample_rate; {choose('time', table.names)}"
@@ -307,17 +326,17 @@ def _time(
                 f"the file holds {number} = {value:g}; if that is the sampling, write "
                 f"sample_rate = {rate:g}"
             )
-    raise CampaignError("no time column", hint=hint)
+    return hint
 
 
-def _time_column(table: FileColumns, first: str) -> str | None:
+def _time_column(names: Collection[str], first: str) -> str | None:
     """The column of time: beside the first channel in its group, or of the whole file."""
     beside = re.match(r"(.*[/.])?", first)
     group = beside[0] if beside else ""
-    for name in table.columns:
+    for name in names:
         if name.startswith(group) and is_time(name[len(group) :]):
             return name
-    return next((name for name in table.columns if is_time(name)), None)
+    return next((name for name in names if is_time(name)), None)
 
 
 def _seconds(declared: RunDeclaration, table: FileColumns, name: str) -> float:

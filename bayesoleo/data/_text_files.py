@@ -18,6 +18,7 @@ from bayesoleo.data._text_layout import (
     DATE,
     DECIMAL_COMMA,
     MISSING,
+    SNIFFED,
     WHITESPACE,
     FileColumns,
     TextLayout,
@@ -81,10 +82,13 @@ def read_text(
         for k, name in enumerate(names)
         if name and (every or wanted is None or name in wanted or is_time(name))
     ]
-    columns, clocks = _read_values(path, layout, {k: names[k] for k in read}, wanted, progress)
+    columns, clocks, faults = _read_values(
+        path, layout, {k: names[k] for k in read}, wanted, progress
+    )
     _check_filled(path, columns, layout.delimiter, wanted)
     units = {**layout.units, **dict.fromkeys(clocks, "s")}
-    return FileColumns(columns, tuple(name for name in names if name), units)
+    times = {name: fault for name, fault in faults.items() if is_time(name)}
+    return FileColumns(columns, tuple(name for name in names if name), units, faults=times)
 
 
 def _read_values(
@@ -93,8 +97,8 @@ def _read_values(
     read: Mapping[int, str],
     wanted: Collection[str] | None,
     progress: bool,
-) -> tuple[dict[str, Array], list[str]]:
-    """Values by name, and which of them are times of day."""
+) -> tuple[dict[str, Array], list[str], dict[str, CampaignError]]:
+    """Values by name, which of them are times of day, and why columns were not read."""
     import pandas as pd
 
     try:
@@ -113,21 +117,23 @@ def _collect(
     read: Mapping[int, str],
     wanted: Collection[str] | None,
     progress: bool,
-) -> tuple[dict[str, Array], list[str]]:
+) -> tuple[dict[str, Array], list[str], dict[str, CampaignError]]:
     parts: dict[int, list[Array]] = {k: [] for k in read}
     clock: dict[int, pd.Timestamp] = {}
+    faults: dict[str, CampaignError] = {}
     rows = 0
     for table in _tables(path, layout, width, progress):
         for k in list(parts):
             try:
                 parts[k].append(_numbers(path, read[k], table[k], layout, rows, clock, k))
-            except CampaignError:
+            except CampaignError as error:
                 if wanted is None or read[k] in wanted:
                     raise
-                del parts[k]  # its name is that of time, its cells are not
+                del parts[k]  # it may be needed as time, or not at all
+                faults[read[k]] = error
         rows += len(table)
     columns = {read[k]: np.concatenate(found) for k, found in parts.items() if found}
-    return columns, [read[k] for k in clock]
+    return columns, [read[k] for k in clock], faults
 
 
 def _unique(path: Path, names: Sequence[str], wanted: Collection[str] | None) -> list[str]:
@@ -250,18 +256,27 @@ def _numbers(
     wrong = np.flatnonzero(np.isnan(numbers) & column.notna().to_numpy())
     if wrong.size:
         cell = str(column.iloc[wrong[0]])
-        comma = DECIMAL_COMMA.match(cell.strip())
-        hint = _one_sign(layout.decimal) if comma or layout.decimal == "," else "write numbers only"
-        if cell.strip() in layout.names:
-            hint = "the names stand here once more: write each part to a file of its own"
         raise CampaignError(
             f"not a number in {_place(path, layout, before + int(wrong[0]), cell)}",
             file=path.name,
             column=name,
             value=cell,
-            hint=hint,
+            hint=_instead(cell.strip(), layout),
         )
     return numbers
+
+
+def _instead(cell: str, layout: TextLayout) -> str:
+    """What to write instead of a cell that is no number."""
+    if cell in layout.names:
+        return "the names stand here once more: write each part to a file of its own"
+    if DECIMAL_COMMA.match(cell):
+        return _one_sign(layout.decimal)
+    for other in SNIFFED:
+        cells = split_cells(cell, other)
+        if len(cells) == len(layout.names) and all(is_number(c, layout.decimal) for c in cells):
+            return f"separate its numbers by {layout.delimiter!r}, as in the other lines"
+    return _one_sign(layout.decimal) if layout.decimal == "," else "write numbers only"
 
 
 def _one_sign(decimal: str) -> str:

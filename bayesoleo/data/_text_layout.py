@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 WHITESPACE, BLANKS = "whitespace", "two blanks"
 _NAMED = {"whitespace": WHITESPACE, " ": WHITESPACE, "tab": "\t", "comma": ",", "semicolon": ";"}
-_SNIFFED = (",", ";", "\t", "|", WHITESPACE)
+SNIFFED = (",", ";", "\t", "|", WHITESPACE)
 _COMMENT = re.compile(r"^\s*(#+|%+|!+|//+|\*+)\s*")
 DECIMAL_COMMA = re.compile(r"^[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?$")
 _WORDS = re.compile(r"[^\W_]")
@@ -97,6 +97,8 @@ class FileColumns:
         By column, Hz, where the file itself states it.
     numbers : mapping of str to float
         Single numbers beside the columns, such as ``Ts``.
+    faults : mapping of str to CampaignError
+        Why columns whose names are those of time were not read.
     """
 
     columns: Mapping[str, Array]
@@ -104,6 +106,7 @@ class FileColumns:
     units: Mapping[str, str] = field(default_factory=dict)
     sample_rate: Mapping[str, float] = field(default_factory=dict)
     numbers: Mapping[str, float] = field(default_factory=dict)
+    faults: Mapping[str, CampaignError] = field(default_factory=dict)
 
 
 def is_time(name: str) -> bool:
@@ -343,7 +346,7 @@ def _cells(line: str, block: _Block, chosen: str | None) -> list[str]:
     """Cells of a header line: as many as there are columns, if some delimiter splits it so."""
     text = _COMMENT.sub("", line).strip("\r\n")
     width = block.width
-    tries = [chosen] if chosen else [block.delimiter, *_SNIFFED, BLANKS]
+    tries = [chosen] if chosen else [block.delimiter, *SNIFFED, BLANKS]
     splits = [[cell.strip().strip('"') for cell in split_cells(text, one)] for one in tries]
     for cells in splits:
         if width > 1 and sum(cell.endswith((",", ";")) for cell in cells) >= width - 1:
@@ -420,7 +423,7 @@ def find_layout(
     lines[:lead] = [""] * lead
     chosen = _NAMED.get(header_delimiter or "", header_delimiter)
     best: tuple[tuple[float, ...], _Block, _Header] | None = None
-    for one in [_NAMED.get(delimiter, delimiter)] if delimiter else _SNIFFED:
+    for one in [_NAMED.get(delimiter, delimiter)] if delimiter else SNIFFED:
         for decimal in _decimals(lines, one):
             block = _find_block(lines, one, decimal)
             if block is None:

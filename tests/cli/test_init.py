@@ -106,6 +106,14 @@ def test_a_file_that_cannot_be_read_is_left_out(folder):
     assert len(found.campaign.runs) == 3
 
 
+def test_a_damaged_time_column_is_told(tmp_path):
+    write(tmp_path / "a.csv", rows(1.0), "time_s,F_N,x_mm")
+    file = tmp_path / "a.csv"
+    file.write_text(file.read_text().replace("\n0.5,", "\nabc,", 1))
+    found = start_campaign(tmp_path)
+    assert "column time_s was left out: file a.csv, column time_s: not a number" in found.notes[0]
+
+
 def test_a_folder_without_records_is_refused(tmp_path):
     with pytest.raises(CampaignError, match="no file here holds a record"):
         start_campaign(tmp_path)

@@ -6,6 +6,7 @@ import pytest
 import scipy.io
 import xarray as xr
 
+from bayesoleo.data import load_campaign
 from bayesoleo.data._files import read_columns
 from bayesoleo.errors import CampaignError
 
@@ -123,3 +124,30 @@ def test_not_text(tmp_path):
     path.write_bytes(bytes(range(128, 256)))
     with pytest.raises(CampaignError, match="not a text file"):
         read_columns(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "hint"),
+    [
+        ("0.6", "abc", r"line 32 \(got 'abc'\)", "write numbers only"),
+        ("0.6,", "0.6;", r"line 32 \(got '0.6;", "separate its numbers by ','"),
+    ],
+)
+def test_a_damaged_time_is_told_and_not_missed(make_campaign, old, new, line, hint):
+    """A cell that is no number leaves out no column of time that nobody declares."""
+    folder = make_campaign()
+    file = folder / "a.csv"
+    rows = file.read_text().split("\n")
+    assert rows[31].startswith(old)
+    rows[31] = rows[31].replace(old, new, 1).replace(",", ";" if ";" in new else ",")
+    file.write_text("\n".join(rows))
+    message = rf"file a.csv, run a, column time_s: not a number in {line}.*; {hint}.*sample_rate"
+    with pytest.raises(CampaignError, match=message):
+        load_campaign(folder)
+
+
+def test_a_damaged_time_does_not_matter_where_the_rate_is_stated(make_campaign):
+    folder = make_campaign({"frequency = 1.0": "frequency = 1.0\nsample_rate = 50.0"})
+    file = folder / "a.csv"
+    file.write_text(file.read_text().replace("\n0.6,", "\nabc,", 1))
+    assert load_campaign(folder).runs[0].time_step == pytest.approx(0.02)
