@@ -45,6 +45,9 @@ _SI_NAMES = {
 #: A torque has the base units of an energy; which one is meant shows in how it is written.
 _ENERGY, TORQUE = "J", "N*m"
 
+#: Second meanings of units as rigs write them: standard gravity, degree Celsius.
+SECOND_MEANINGS = {"g": "g_0", "mg": "mg_0", "C": "degC"}
+
 #: Words at the end of a channel's or a condition's name that fix its SI unit.
 _EXPECTED = {
     "pressure": ("Pa", "bar"),

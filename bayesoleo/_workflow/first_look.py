@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from bayesoleo._types import Array
-from bayesoleo._units import check_kind, parse_unit
+from bayesoleo._units import SECOND_MEANINGS, check_kind, parse_unit
 from bayesoleo._workflow.model_files import write_first_model
 from bayesoleo.data._campaign import CampaignData, load_campaign
 from bayesoleo.data._campaign_toml import FILE
@@ -64,6 +64,19 @@ _WORDS = (
 _FEWEST, _MOST = 20, 24
 #: Of a time column whose name does not tell.
 _EVEN = f"{TO_FILL_IN}: it increases evenly, and is taken for time in s; time_unit states another"
+#: Units of two meanings: what pint reads and the names that tell it, the other and its names.
+_FIRST_MASS = re.compile(r"mass|weight|gewicht", re.IGNORECASE)
+_SECOND_ACCELERATION = re.compile(r"(?i:acc|beschl)|^[aA][xyzXYZ]?(_|\d|$)")
+_MEANINGS = {
+    "g": ("gram", _FIRST_MASS, "standard gravity", _SECOND_ACCELERATION),
+    "mg": ("milligram", _FIRST_MASS, "a thousandth of standard gravity", _SECOND_ACCELERATION),
+    "C": (
+        "coulomb",
+        re.compile(r"charge|ladung", re.IGNORECASE),
+        "degree Celsius",
+        re.compile(r"(?i:temp)|^T[a-z]{0,4}(_|\d|$)"),
+    ),
+}
 #: Units of mass that stand for forces.
 _AS_FORCE = {"lb": "lbf", "lbs": "lbf", "kg": "kgf", "g": "gf", "t": "tf"}
 
@@ -358,12 +371,26 @@ def _unit_of(column: str, table: FileColumns) -> tuple[str, str, bool, str]:
         guess = _AS_FORCE[unit]
         why = f"{TO_FILL_IN}: {unit} is a mass; {guess} is assumed"
         return guess, why, False, "force"
+    known = True
+    if unit in _MEANINGS:
+        unit, why, known = _of_two_meanings(unit, _bare_name(column), why)
     if unit and _parses(unit):
-        return unit, why, True, _QUANTITIES.get(parse_unit(unit).si_name, "")
+        return unit, why, known, _QUANTITIES.get(parse_unit(unit).si_name, "")
     why = f"{TO_FILL_IN}: the file does not say the unit of {column}"
     if word is None:
         return "1", why, False, ""
     return word[2], f"{why}; {word[2]} is assumed", False, word[1]
+
+
+def _of_two_meanings(unit: str, name: str, why: str) -> tuple[str, str, bool]:
+    """The unit that a column's name tells, what it follows from, and whether it is known."""
+    first, names_first, second, names_second = _MEANINGS[unit]
+    other = SECOND_MEANINGS[unit]
+    if names_second.search(name):
+        return other, f"{why}; {other} is {second}", True
+    if names_first.search(name):
+        return unit, why, True
+    return other, f"{TO_FILL_IN}: {first} or {second}? {other}, {second}, is assumed", False
 
 
 def _channel(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesoleo._types import Array, Float
-from bayesoleo._units import parse_unit
+from bayesoleo._units import SECOND_MEANINGS, parse_unit
 from bayesoleo.data._campaign_toml import FILE, Channel, RunDeclaration
 from bayesoleo.data._sample_quality import Stretches, bridged, impossible_sample, masked
 from bayesoleo.data._text_layout import TIME_UNITS, FileColumns, is_time, time_unit, unit_in_name
@@ -226,19 +226,26 @@ def _compare_units(
     """Warn where the file states another unit than the campaign."""
     for name, column in names.items():
         stated, channel = table.units.get(column), channels[name]
-        if stated is None or stated == channel.unit or abs(channel.scale) != 1:
+        if stated is None or abs(channel.scale) != 1:
             continue
-        try:
-            there, here = parse_unit(stated), parse_unit(channel.unit)
-        except CampaignError:
-            continue
-        if there.si_name != here.si_name or not np.isclose(there.factor, here.factor, rtol=1e-9):
+        if not any(_same(one, channel.unit) for one in (stated, SECOND_MEANINGS.get(stated, ""))):
             warnings.warn(
                 f"run {declared.label}, file {declared.file}: the file says that column {column} "
                 f"is in {stated}, and {FILE} that it is in {channel.unit}; {channel.unit} is taken",
                 DataWarning,
                 stacklevel=2,
             )
+
+
+def _same(stated: str, unit: str) -> bool:
+    """Whether two units convert alike; one that cannot be read may."""
+    if not stated:
+        return False
+    try:
+        there, here = parse_unit(stated), parse_unit(unit)
+    except CampaignError:
+        return True
+    return there.si_name == here.si_name and bool(np.isclose(there.factor, here.factor, rtol=1e-9))
 
 
 def _made(

@@ -82,6 +82,44 @@ def test_what_files_do_not_say_is_asked(tmp_path):
     assert any("column n was left out: it counts samples" in note for note in found.notes)
 
 
+@pytest.mark.parametrize(
+    ("column", "name", "unit"),
+    [
+        ("acc_g", "acceleration", "g_0"),
+        ("a_top_mg", "acceleration", "mg_0"),
+        ("ax [g]", "acceleration", "g_0"),
+        ("T_C", "temperature", "degC"),
+        ("Tamb_C", "temperature", "degC"),
+        ("oil temp (C)", "temperature", "degC"),
+        ("mass_g", "mass", "g"),
+        ("charge_C", "charge", "C"),
+    ],
+)
+def test_the_quantity_decides_between_two_meanings_of_a_unit(tmp_path, recwarn, column, name, unit):
+    write(tmp_path / "a.csv", rows(1.0), f"time_s,{column},x_mm")
+    found = start_campaign(tmp_path)
+    channel = found.campaign.channels[name]
+    assert (channel.column, channel.unit) == (column, unit)
+    assert [q.split(":")[0] for q in found.questions] == ["controlled"]
+    assert not recwarn.list  # that the file states g means the same
+
+
+@pytest.mark.parametrize(
+    ("column", "unit", "meanings"),
+    [
+        ("top_g", "g_0", "gram or standard gravity?"),
+        ("oil_C", "degC", "coulomb or degree Celsius?"),
+        ("force_g", "gf", "g is a mass"),
+    ],
+)
+def test_a_unit_of_two_meanings_is_asked(tmp_path, column, unit, meanings):
+    write(tmp_path / "a.csv", rows(1.0), f"time_s,{column},x_mm")
+    question, _ = start_campaign(tmp_path).questions
+    assert f"the unit of column {column}; '{unit}' stands there now" in question
+    text = (tmp_path / "campaign.toml").read_text()
+    assert f'unit = "{unit}"  # TO FILL IN: {meanings}' in text
+
+
 def test_a_free_decay_is_a_transient(tmp_path):
     time = np.arange(2000) / 100
     angle = np.exp(-0.2 * time) * np.cos(6 * time)
