@@ -21,7 +21,7 @@ from bayesoleo.data._fourier import HarmonicBasis
 from bayesoleo.data._harmonics import foreign_lines
 from bayesoleo.data._noise import average_on, periodic_average
 from bayesoleo.data._sample_quality import clipped, coarse_steps, repeating_rounding
-from bayesoleo.prediction._records import Record
+from bayesoleo.prediction._records import Disturbances, Record
 
 #: Probability of flagging any channel of a run without drift.
 FALSE_ALARM = 1e-3
@@ -304,14 +304,7 @@ def _about_removed(records: Sequence[Record], units: Mapping[str, str]) -> list[
     for channel in dict.fromkeys(name for r in records for name in r.disturbances):
         there = [(r, r.disturbances[channel]) for r in records if channel in r.disturbances]
         unit = _unit(units, channel)
-        runs = [r.label for r, item in there if item.drift]
-        if runs:
-            largest = max(item.drift for _, item in there)
-            found.append(
-                f"{channel} drifts ({_runs(runs)}), by up to {largest:.2g}{unit} root mean square: "
-                "the drift was removed, and the mean of each run is estimated as unknown; to keep "
-                "it leave drift out of disturbances"
-            )
+        found += _about_drift(channel, there, unit)
         tones = [(tone, r.label) for r, item in there for tone in item.tones]
         if tones:
             loudest, where = max(tones, key=lambda pair: pair[0].amplitude)
@@ -331,6 +324,24 @@ def _about_removed(records: Sequence[Record], units: Mapping[str, str]) -> list[
                 "tails out of disturbances"
             )
     return found
+
+
+def _about_drift(
+    channel: str, there: Sequence[tuple[Record, Disturbances]], unit: str
+) -> list[str]:
+    """The drift that was removed from a channel, with the runs in which it was found."""
+    drifts = {r.label: item.drift for r, item in there if item.drift and not item.drift_elsewhere}
+    if not drifts:
+        return []
+    others = any(item.drift_elsewhere for _, item in there)
+    alike = (
+        ", and alike in the other periodic runs, since their sensor is the same" if others else ""
+    )
+    return [
+        f"{channel} drifts ({_runs(list(drifts))}), by up to {max(drifts.values()):.2g}{unit} root "
+        f"mean square: the drift was removed{alike}, and the mean of each run is estimated as "
+        "unknown; to keep it leave drift out of disturbances"
+    ]
 
 
 def _runs(labels: Sequence[str]) -> str:

@@ -98,14 +98,18 @@ def without_disturbances(
     # A sensor that drifts in one run drifts in all of them.
     drifting = frozenset(name for r in found for name, it in r.disturbances.items() if it.drift)
 
-    def misses_one(record: Record) -> bool:
-        there = {name for name, item in record.disturbances.items() if item.drift}
-        return not drifting <= there
+    def alike(record: Record, one: Record) -> Record:
+        own = {name for name, item in one.disturbances.items() if item.drift}
+        if drifting <= own:
+            return one
+        again = _cleaned(record, channels, drifting, level, kinds)
+        told = {
+            name: replace(item, drift_elsewhere=name in drifting - own)
+            for name, item in again.disturbances.items()
+        }
+        return replace(again, disturbances=told) if told else again
 
-    return tuple(
-        _cleaned(record, channels, drifting, level, kinds) if misses_one(one) else one
-        for record, one in zip(records, found, strict=True)
-    )
+    return tuple(alike(record, one) for record, one in zip(records, found, strict=True))
 
 
 def _cleaned(

@@ -153,12 +153,15 @@ class Disturbances:
     degrees : float
         Degrees of freedom of the Student-t noise whose outliers were weighted down; zero where the
         noise is normal.
+    drift_elsewhere : bool
+        Whether the drift was not found here, but removed because the channel drifts in other runs.
     """
 
     drift: float = 0.0
     terms: int = 0
     tones: tuple[Tone, ...] = ()
     degrees: float = 0.0
+    drift_elsewhere: bool = False
 
     def __bool__(self) -> bool:
         return bool(self.drift or self.tones or self.degrees)

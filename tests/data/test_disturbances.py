@@ -228,6 +228,18 @@ def test_a_drifting_output_has_an_unknown_mean_in_each_run(tmp_path):
     assert not wanted & set(checked(kept)["unknowns"])
 
 
+def test_only_runs_where_a_drift_was_found_are_said_to_drift(tmp_path):
+    records = list(damper_campaign(tmp_path, spring_damper_force).records)
+    force, place = records[1].samples["force"], np.linspace(0, 1, records[1].time.size)
+    samples = {**records[1].samples, "force": force + 20 * place**2}
+    records[1] = replace(records[1], samples=samples)
+    cleaned = without_disturbances(records, ["force"])
+    assert all(one.disturbances["force"].drift for one in cleaned)
+    (sentence,) = [text for text in data_warnings(cleaned) if "drift was removed" in text]
+    assert sentence.startswith("force drifts (run b), by up to 6")
+    assert "the drift was removed, and alike in the other periodic runs, since" in sentence
+
+
 def test_a_plain_campaign_is_left_as_it_is(tmp_path):
     reduced = damper_campaign(tmp_path, spring_damper_force)
     records = without_disturbances(reduced.records, ["force"])
