@@ -117,7 +117,9 @@ def format_p(value: float | None) -> str:
 
 def format_share(gain: float) -> str:
     """A part of the excess error in per cent; a negative one explains nothing of it."""
-    return f"{100 * gain:.1f} %" if gain >= 0.0005 else "none"
+    if not gain > 0.0:
+        return "none"
+    return f"{100 * gain:.1f} %" if gain >= 0.0005 else "< 0.1 %"
 
 
 def format_probability(value: float) -> str:

@@ -316,9 +316,9 @@ def test_shares_of_no_excess_are_not_drawn(oleo):
     assert texts(nothing) == ["no error beyond the noise: force, pressure"]
 
 
-def test_a_share_below_nothing_is_none():
-    assert [format_share(gain) for gain in (-1.0, 0.0, 4e-4, 0.0126, 1.0)] == [
-        "none", "none", "none", "1.3 %", "100.0 %"
+def test_a_share_below_nothing_is_none_and_a_small_one_is_not():
+    assert [format_share(gain) for gain in (-1.0, 0.0, 4e-4, 5e-4, 0.0126, 1.0)] == [
+        "none", "none", "< 0.1 %", "0.1 %", "1.3 %", "100.0 %"
     ]  # fmt: skip
 
 
