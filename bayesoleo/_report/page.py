@@ -39,6 +39,7 @@ from bayesoleo.errors import InputError, ResultsError
 from bayesoleo.plots import _reading as reading
 from bayesoleo.plots._discovery import chosen, format_share, name
 from bayesoleo.plots._residuals import has_excess
+from bayesoleo.plots._style import DIMENSIONLESS
 
 #: A harmonic or a coordinate is named if it holds this part of the excess.
 WORTH_NAMING = 0.2
@@ -240,7 +241,8 @@ def _large(summary: Mapping[str, Any]) -> str:
             if summary["parameters"][row[0]].get("shared_with"):
                 texts.append(f"{what} {interval}")
                 continue
-            text = f"{what} = {cells['estimate']} ± {cells['sd']} {cells['unit']}".rstrip()
+            unit = "" if cells["unit"] in DIMENSIONLESS else f" {cells['unit']}"
+            text = f"{what} = {cells['estimate']} ± {cells['sd']}{unit}"
             known = any(character.isdigit() for character in interval)
             texts.append(f"{text} (95 %: {interval})" if known else text)
     most = 6

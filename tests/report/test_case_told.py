@@ -31,6 +31,17 @@ def test_what_it_is_how_large_and_whether_it_holds(answers):
     assert "best remaining candidate" in found["What is left?"]
 
 
+def test_a_number_without_a_unit_has_none_in_a_sentence(answers, oleo):
+    summary = json.loads(json.dumps(answers[1]))
+    added = next(c for c in summary["rounds"][0]["candidates"] if c["expected"])
+    for name in added["expected"]:
+        summary["parameters"][name]["unit"] = ""
+        summary["parameters"][name].update(estimate=-1.0, mean=-1.0, sd=0.7, interval=None)
+    answer = dict(case(summary, {}, oleo))["How large?"]
+    assert answer.count("= −1.00 ± 0.70") == len(added["expected"])
+    assert "± 0.70 1" not in answer
+
+
 def test_how_sure_a_name_is(answers, oleo):
     summary = json.loads(json.dumps(answers[1]))
     question = "How sure is its name?"
