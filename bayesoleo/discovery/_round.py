@@ -162,7 +162,7 @@ def _stopping_reason(
     if state.at_floor and best < policy.floor_share:
         return (
             f"no effect is missing: the residual is at most {worst:.2f} times the expected error"
-            f" and no effect explains more than {100 * best:.0f} % of the excess"
+            f" and no effect explains more than {100 * best:.1f} % of the excess"
         )
     if not any(_may_be_significant(item, tests, policy) for item in ranking):
         return INSIGNIFICANT

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ import bayesoleo
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.discovery._fit_and_hold_out_error import limit
 from bayesoleo.discovery._policy import SearchPolicy, policy_table
+from bayesoleo.discovery._round import _stopping_reason
 
 PACKAGE = Path(bayesoleo.__file__).parent
 #: Callers of the search's functions. A prediction is made from a stored result, without a policy.
@@ -104,3 +106,10 @@ def test_the_scale_of_equal_likelihood(odds, scale):
 
 def test_what_confirms_exceeds_its_error_as_often_as_is_asked_for():
     assert SearchPolicy().confirming_errors == pytest.approx(1.96, abs=1e-3)
+
+
+def test_the_best_share_is_stated_as_exactly_as_in_the_report():
+    state = SimpleNamespace(worst_ratio=1.04, at_floor=True)
+    reason = _stopping_reason(state, [SimpleNamespace(gain=0.0517)], 10.0, SearchPolicy())
+    assert reason is not None
+    assert reason.endswith("no effect explains more than 5.2 % of the excess")
