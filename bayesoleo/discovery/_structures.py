@@ -10,7 +10,7 @@ family the laws that textbooks begin with weigh more than their refinements.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from bayesoleo.discovery._assembly import Added
@@ -198,6 +198,11 @@ class AveragedParameter:
         return cls(None, None, None, None, None, reason)
 
 
+def total_probability(structures: Iterable[Structure]) -> float:
+    """Probability that one of these structures is true; rounding takes no sum above one."""
+    return min(1.0, sum(s.probability for s in structures))
+
+
 @dataclass(frozen=True)
 class StructurePosterior:
     """Probabilities of all structures that were compared.
@@ -218,17 +223,17 @@ class StructurePosterior:
     @property
     def nothing(self) -> float:
         """Probability that nothing is missing."""
-        return sum(s.probability for s in self.structures if not s.effects and not s.outside)
+        return total_probability(s for s in self.structures if not s.effects and not s.outside)
 
     @property
     def outside(self) -> float:
         """Probability that something outside the catalogue acts, alone or beside effects."""
-        return sum(s.probability for s in self.structures if s.outside)
+        return total_probability(s for s in self.structures if s.outside)
 
     @property
     def only_outside(self) -> float:
         """Probability that something outside the catalogue acts, and no effect of it."""
-        return sum(s.probability for s in self.structures if s.outside and not s.effects)
+        return total_probability(s for s in self.structures if s.outside and not s.effects)
 
     @property
     def effects(self) -> dict[Added, float]:
@@ -236,5 +241,5 @@ class StructurePosterior:
         found: dict[Added, float] = {}
         for structure in self.structures:
             for key in structure.effects:
-                found[key] = found.get(key, 0.0) + structure.probability
+                found[key] = min(1.0, found.get(key, 0.0) + structure.probability)
         return dict(sorted(found.items(), key=lambda item: -item[1]))

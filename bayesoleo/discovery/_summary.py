@@ -18,7 +18,7 @@ from bayesoleo.discovery._round import Round
 from bayesoleo.discovery._score_basis import squared_distance
 from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._state import State
-from bayesoleo.discovery._structures import Structure, StructurePosterior
+from bayesoleo.discovery._structures import Structure, StructurePosterior, total_probability
 from bayesoleo.effects._catalogue import titles_for, with_titles
 from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.estimation._baselines import common_baselines, notes_on
@@ -191,7 +191,7 @@ def _classes(loop: ClosedLoop, found: StructurePosterior) -> list[dict[str, Any]
             members = [k for k in found.effects if family.get(k) == family.get(key, "")]
         if sum(found.effects[k] >= VISIBLE for k in members) < OF_A_CLASS:
             continue
-        acts = sum(s.probability for s in found.structures if set(s.effects) & set(members))
+        acts = total_probability(s for s in found.structures if set(s.effects) & set(members))
         entry = {
             "effects": [f"{effect} @ {target}" for effect, target in members],
             "family": None if alike else family.get(key),

@@ -213,3 +213,13 @@ def test_what_was_found_stands_where_probabilities_fail(monkeypatch):
     assert ended.rounds == found.rounds
     (note,) = ended.notes
     assert note == f"{_loop.NO_PROBABILITIES}: Matrix is not positive definite"
+
+
+def test_rounding_leaves_no_probability_above_one():
+    quarter = np.nextafter(0.25, 1.0)
+    outside = [((), True), ((PLAY,), True), ((OTHER,), True), ((PLAY, OTHER), True)]
+    found = posterior(dict.fromkeys(outside, quarter))
+    assert sum(one.probability for one in found.structures) > 1.0
+    assert found.outside == 1.0
+    acts = [((PLAY,), True), ((PLAY,), False), ((PLAY, OTHER), True), ((PLAY, OTHER), False)]
+    assert posterior(dict.fromkeys(acts, quarter)).effects[PLAY] == 1.0
