@@ -37,8 +37,9 @@ MOST_HARMONICS, MOST_COSINES = 600, 1500
 FEWEST_HARMONICS, BEYOND = 60, 1e-5
 #: Lines of a transient that are kept whether its signals lie there or not.
 FIRST_COSINES = 300
-#: A measured level of few lines is averaged with that of all lines as if it had so many more.
-PRIOR_LINES = 8.0
+#: A measured level of few lines is averaged with that of more lines around, as if it had so many
+#: more: of lines from half to twice the frequency, and so many harmonics on either side.
+PRIOR_LINES, SPREAD = 8.0, 3
 #: Directions of the errors of the inputs that are kept in a run.
 MOST_INPUTS = 40
 #: Lines on either side over which the variance by draws of an input's noise is averaged.
@@ -129,7 +130,8 @@ class RunLines:
         if spectrum is None:
             return mean + rounding
         free = max(2.0 * spectrum.lines, 1.0)
-        level = (free * spectrum.level + PRIOR_LINES * mean) / (free + PRIOR_LINES)
+        around = _around(spectrum.level, SPREAD * spectrum.lines)
+        level = (free * spectrum.level + PRIOR_LINES * around) / (free + PRIOR_LINES)
         chosen = level[np.minimum(self.lines, level.size - 1)]
         return np.maximum(np.tile(chosen, 2), 1e-6 * mean) + rounding
 
@@ -254,6 +256,17 @@ def _principal(rows: Array) -> Array:
     values, vectors = np.linalg.eigh(rows @ rows.T)
     order = np.argsort(-values)[:MOST_INPUTS]
     return np.asarray(vectors[:, order].T @ rows)
+
+
+def _around(level: Array, more: int) -> Array:
+    """Mean level of the lines from half to twice each line's number, and some more, shape (K,).
+
+    The mean of all lines would be too small where noise is slow, and promise too much there.
+    """
+    line = np.arange(level.size)
+    low, high = np.maximum(line // 2 - more, 0), np.minimum(2 * line + more + 1, level.size)
+    total = np.concatenate([[0.0], np.cumsum(level)])
+    return np.asarray((total[high] - total[low]) / (high - low))
 
 
 def _of_neighbours(variance: Array, size: int, draws: int) -> Array:
