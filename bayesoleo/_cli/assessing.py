@@ -124,7 +124,7 @@ def _file_of(figure: Path, output: str) -> Path:
     return figure.with_stem(f"{figure.stem}-{schema.variable_name(output)}")
 
 
-@options.of_settings("seed", "jobs")
+@options.of_settings("seed", "jobs", "disturbances")
 def predict(
     results: Annotated[
         Path, options.argument("RESULTS.nc", "results.nc of estimate, sample or close.")
@@ -186,6 +186,7 @@ def predict(
         seed=chosen.seed,
         jobs=chosen.jobs,
         common_offset=common_offset,
+        disturbances=chosen.disturbances,
     )
     if as_json:
         shell.print_json(_numbers(found.data).drop_vars(schema.TIME).to_dict())

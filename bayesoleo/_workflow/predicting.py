@@ -22,9 +22,12 @@ from bayesoleo import _schema as schema
 from bayesoleo._schema import LabelledResult, columns, variable
 from bayesoleo._types import Array, Float
 from bayesoleo._workflow.predicted_starts import drawn_starts, estimated_starts, unknown_starts
+from bayesoleo._workflow.settings import DISTURBANCES
 from bayesoleo._workflow.simulating import model_of, parameter_sets, same_noise, same_samples
 from bayesoleo.assessment._residual_breakdown import judged_errors
 from bayesoleo.assessment._residual_tests import PredictiveScore, score_draws
+from bayesoleo.data._data_warnings import removed_text
+from bayesoleo.data._disturbances import without_disturbances
 from bayesoleo.data._noise import local_means
 from bayesoleo.data._reduction import ReducedCampaign
 from bayesoleo.discovery._expected_error import most_by_chance
@@ -56,6 +59,8 @@ STEPS, POINTS = 512, 200
 BINS = 20
 #: Attribute that tells which offsets were added.
 ADDED = "added"
+#: Attribute that tells what was removed from outputs.
+REMOVED = "removed"
 _NUMBERS = {
     "rms": ("root mean square of what was measured less the mean of the prediction", True),
     "bias": ("mean of it", True),
@@ -104,6 +109,7 @@ def predict(
     steps: int | None = None,
     jobs: int | None = None,
     common_offset: bool = False,
+    disturbances: Sequence[str] = DISTURBANCES,
 ) -> LabelledResult:
     """Predict runs from a result and hold the prediction against what was measured.
 
@@ -132,6 +138,9 @@ def predict(
     common_offset : bool, optional
         Add to outputs that drift the offset that the fitted runs have in common, with its
         uncertainty; a fitted run has its own. Nothing is added by default.
+    disturbances : sequence of {"drift", "tone", "tails"}, optional
+        What is removed from outputs before they are compared, as before an estimate: tones that are
+        no harmonics, and outliers. Drift stays, since a prediction says where an output is.
 
     Returns
     -------
@@ -164,6 +173,9 @@ def predict(
     # As inputs the channels count as far as they did in the fit.
     given = [name for name, c in campaign.campaign.channels.items() if c.bandwidth is not None]
     chosen, _ = without_invented(used, chosen, given)
+    kinds = [kind for kind in disturbances if kind != "drift"]
+    chosen = without_disturbances(chosen, list(used.outputs), kinds)
+    removed = removed_text(chosen, campaign.campaign.units)
     added = baselines_in(tree[schema.POINT].to_dataset()) if common_offset else []
     if common_offset:
         check_baselines(added, used)
@@ -179,7 +191,7 @@ def predict(
         _as_judged(tree, record, run, used) for record, run in zip(records, found, strict=True)
     ]
     data = _dataset(used, records, found)
-    data.attrs = {"level": level, "draws": draws, "model": used.name}
+    data.attrs = {"level": level, "draws": draws, "model": used.name, REMOVED: removed}
     if added:
         data = _with_added(data, added)
     return LabelledResult(data, forecast_text(data))
@@ -447,8 +459,7 @@ def forecast_text(data: xr.Dataset) -> str:
             ]
             rows.append([str(output), str(run), *cells])
     lines = [columns(head, rows), f"{data.attrs['draws']} draws of {data.attrs['model']}"]
-    if data.attrs.get(ADDED):
-        lines.append(str(data.attrs[ADDED]))
+    lines += [str(data.attrs[key]) for key in (ADDED, REMOVED) if data.attrs.get(key)]
     for run in data[schema.RUN].values:
         failed = json.loads(str(data["failed"].sel(run=run).values))
         if failed:

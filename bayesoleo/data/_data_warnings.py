@@ -298,6 +298,18 @@ def _jump(before: Record, after: Record, channel: str) -> float | None:
     return float(abs(first[0] - last[-1]) / usual)
 
 
+def removed_text(records: Sequence[Record], units: Mapping[str, str]) -> str:
+    """What was removed from channels, in sentences; empty where nothing was.
+
+    Parameters
+    ----------
+    records : sequence of Record
+    units : mapping of str to str
+        Of the channels, as they are told.
+    """
+    return "; ".join(_about_removed(records, units))
+
+
 def _about_removed(records: Sequence[Record], units: Mapping[str, str]) -> list[str]:
     """What was removed from channels, one sentence a channel and kind."""
     found = []

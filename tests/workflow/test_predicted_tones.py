@@ -1,0 +1,40 @@
+"""What is removed before an estimate is removed before its predictions are judged."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_campaigns import damper, damper_campaign, spring_damper_force
+
+import bayesoleo as bo
+
+NOISE, TONE = 0.1, 0.6
+
+
+def with_tone(x, v, t):
+    return spring_damper_force(x, v, t) + TONE * np.sin(2 * np.pi * 17.3 * t)
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory):
+    folder = damper_campaign(tmp_path_factory.mktemp("tone"), with_tone, noise=NOISE)
+    return bo.load_campaign(folder, progress=False)
+
+
+@pytest.fixture(scope="module")
+def fit(campaign):
+    return bo.Problem(campaign, damper()).fit()
+
+
+def test_a_tone_is_removed_before_a_prediction_is_judged(fit, campaign):
+    found = fit.predict(campaign)
+    np.testing.assert_allclose(found.data["rms"], NOISE, rtol=0.15)
+    np.testing.assert_allclose(found.data["coverage"], 0.95, atol=0.03)
+    assert "tone that is no harmonic of the drive" in str(found)
+    assert "it was removed" in str(found)
+
+
+def test_it_stays_where_that_is_asked_for(fit, campaign):
+    found = fit.predict(campaign, disturbances=())
+    assert (found.data["rms"] > 3 * NOISE).all()
+    assert "removed" not in str(found)
