@@ -94,13 +94,13 @@ def _said(summary: Mapping[str, Any]) -> str:
     if sure is None:
         return f"{_nothing_added(summary)}{apart}"
     likely = structures.with_probability(summary)
+    outside = structures.outside_acts(summary, structures.of_set(summary))
     down = f"the error is then down to {words(summary)}"
     if sure == schema.CERTAIN:
         return f"Certain: {found} {was} missing{likely}; {down}.{structures.next_best(summary)}"
     if sure == schema.PROBABLE:
         lead = _probable(summary, f"{found} {was}")
-        return f"{lead}{likely}; {down}.{_class(summary)}{apart}"
-    outside = structures.outside_acts(summary)
+        return f"{lead}{likely}; {down}.{outside}{_class(summary)}{apart}"
     if sure == schema.NO_CAUSE and summary["verdict"] == schema.EFFECT_ADDED:
         return f"No cause is named: {found} {was} added; {down}.{outside or _class(summary)}"
     lead = "No cause is named" if sure == schema.NO_CAUSE else "A likeness only"
@@ -120,19 +120,21 @@ def _nothing_added(summary: Mapping[str, Any]) -> str:
         p = structures.spoken(found["nothing"])
         if found["nothing"] >= structures.LIKELY:
             return f"Nothing is missing, with probability {p}: {explains}."
-        return f"Nothing was added: {explains}; but that nothing is missing has probability {p}."
+        text = f"Nothing was added: {explains}; but that nothing is missing has probability {p}."
+        return text + structures.outside_unsaid(summary, found["nothing"])
     lead = "No verdict" if only_too_small(summary) else structures.lead_of_unexplained(summary)
-    return f"{lead}: {_size_left(summary)}{_unexplained(summary)}."
+    outside = structures.outside_unsaid(summary)
+    return f"{lead}: {_size_left(summary)}{_unexplained(summary)}.{outside}"
 
 
 def _probable(summary: Mapping[str, Any], found: str) -> str:
     """Beginning of the headline for effects that explain everything but have alternatives."""
-    of = structures.of_added(summary)
-    if not of or min(of) >= structures.LIKELY:
+    of, every = structures.of_set(summary), structures.known(summary)
+    if of is None or of >= structures.LIKELY:
         return f"Probable: {found} missing"
-    every = structures.known(summary)
+    # That each effect, or one like it, is probable does not make all of them probable together.
     together = [] if every is None else [one["probability"] for one in every["classes"]]
-    if together and min(together) >= structures.LIKELY:
+    if len(summary["effects"]) == 1 and together and min(together) >= structures.LIKELY:
         return f"Probable as one of a class: {found} added"
     return f"One explanation of several: {found} added"
 

@@ -57,11 +57,30 @@ def of_added(summary: Mapping[str, Any]) -> list[float]:
     return [p for p in found if p is not None] if None not in found else []
 
 
+def of_set(summary: Mapping[str, Any]) -> float | None:
+    """Probability that all added effects act together; None where one of them was not compared."""
+    found, single = known(summary), of_added(summary)
+    if found is None or not single:
+        return None
+    if len(single) == 1:
+        return single[0]
+    if found.get("together") is not None:
+        return float(found["together"])
+    own = set(added_names(summary))  # of a result that was stored without it
+    return float(sum(one["probability"] for one in found["list"] if own <= set(one["effects"])))
+
+
 def with_probability(summary: Mapping[str, Any]) -> str:
-    """``, with probability 0.97`` after the effects that were added."""
-    found = [spoken(p) for p in of_added(summary)]
-    word = "probability" if len(found) == 1 else "probabilities"
-    return f", with {word} {listed(found)}" if found else ""
+    """``, with probability 0.97`` after the effects that were added; of several also that of all
+    together, which may be much smaller than each."""
+    single, together = of_added(summary), of_set(summary)
+    if not single or together is None:
+        return ""
+    found = [spoken(p) for p in single]
+    if len(found) == 1:
+        return f", with probability {found[0]}"
+    every = "both" if len(found) == 2 else f"all {len(found)}"
+    return f", with probabilities {listed(found)}, and {spoken(together)} for {every} together"
 
 
 def next_best(summary: Mapping[str, Any]) -> str:
@@ -186,13 +205,37 @@ def lead_of_unexplained(summary: Mapping[str, Any]) -> str:
     return lead
 
 
-def outside_acts(summary: Mapping[str, Any]) -> str:
-    """That something outside the catalogue acts, as a sentence, where it probably does."""
+def outside_acts(summary: Mapping[str, Any], than: float | None = None) -> str:
+    """That something outside the catalogue acts, as a sentence, where it probably does or is more
+    probable than what the headline names.
+
+    Parameters
+    ----------
+    summary : mapping
+    than : float, optional
+        Probability of what the headline names.
+    """
     found = known(summary)
-    if found is None or found["outside"] < LIKELY:
+    if found is None:
         return ""
     p = spoken(found["outside"])
-    return f" Something outside the catalogue acts, with probability {p}."
+    if found["outside"] >= LIKELY:
+        return f" Something outside the catalogue acts, with probability {p}."
+    if than is not None and found["outside"] > max(than, SHOWN):
+        return f" That something outside the catalogue acts is more probable: {p}."
+    return ""
+
+
+def outside_unsaid(summary: Mapping[str, Any], than: float | None = None) -> str:
+    """The same sentence where nothing was added; empty where the headline names it already."""
+    found = known(summary)
+    leads = found is not None and (
+        found["only_outside"] >= LIKELY or found["outside"] >= NEARLY_SURE
+    )
+    if summary["verdict"] == schema.UNEXPLAINED and leads:
+        return ""
+    alone = f"structure is {OUTSIDE} (" in disagreement(summary)
+    return "" if alone else outside_acts(summary, than)
 
 
 def lines(summary: Mapping[str, Any], most: int = 4) -> list[str]:

@@ -134,6 +134,7 @@ def structures_entry(loop: ClosedLoop, titles: Mapping[str, str]) -> dict[str, A
         "nothing": found.nothing,
         "outside": found.outside,
         "only_outside": found.only_outside,
+        "together": _together(loop, found),
         "effects": [
             {"effect": e, "target": t, "title": titles.get(e, e), "probability": probability}
             for (e, t), probability in found.effects.items()
@@ -150,6 +151,14 @@ def structures_entry(loop: ClosedLoop, titles: Mapping[str, str]) -> dict[str, A
         ],
         "parameters": _averages(loop, found),
     }
+
+
+def _together(loop: ClosedLoop, found: StructurePosterior) -> float | None:
+    """Probability that all added effects act; None without any, or where one was not compared."""
+    own = set(loop.added)
+    if not own or not own <= found.effects.keys():
+        return None
+    return sum(one.probability for one in found.structures if own <= set(one.effects))
 
 
 def _averages(loop: ClosedLoop, found: StructurePosterior) -> dict[str, Any]:

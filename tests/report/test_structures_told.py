@@ -143,6 +143,49 @@ def test_an_improbable_name_is_not_called_probable():
     assert "most probable structure is breakaway friction (stroke) (0.60)" in text
 
 
+DRAG = "quadratic_damping @ stroke"
+
+
+def test_several_effects_have_the_probability_of_all_together():
+    """Each may be probable although all at once are not."""
+    pairs = [(COULOMB, STRIBECK), (COULOMB, DRAG), (STRIBECK, DRAG)]
+    table = {(COULOMB, STRIBECK, DRAG): 0.4} | {(*pair, OUTSIDE): 0.2 for pair in pairs}
+    found = summary_of(table, [COULOMB, STRIBECK, DRAG], schema.PROBABLE)
+    text = headline(found)
+    assert text.startswith("One explanation of several: Coulomb friction (stroke), breakaway")
+    assert "were added, with probabilities 0.80, 0.80 and 0.80, and 0.40 for all 3 together" in text
+    assert "Something outside the catalogue acts, with probability 0.60." in text
+    # What was summed over all structures counts more than those that are listed.
+    found["structures"]["together"] = 0.51
+    assert headline(found).startswith("Probable: Coulomb friction (stroke), breakaway")
+    assert "and 0.51 for all 3 together" in headline(found)
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ({(COULOMB,): 0.3, (OUTSIDE,): 0.35, (STRIBECK,): 0.35}, "acts is more probable: 0.35."),
+        ({(COULOMB,): 0.3, (COULOMB, OUTSIDE): 0.6}, "catalogue acts, with probability 0.60."),
+        ({(COULOMB,): 0.6, (OUTSIDE,): 0.4}, ""),
+    ],
+)
+def test_something_outside_is_named_where_it_is_more_probable(table, said):
+    text = headline(summary_of(table, [COULOMB], schema.PROBABLE))
+    assert ("Something outside the catalogue acts" in text or "That something outside" in text) is (
+        said != ""
+    )
+    assert said in text
+
+
+def test_something_outside_is_named_where_nothing_was_added():
+    table = {(COULOMB, OUTSIDE): 0.35, (STRIBECK, OUTSIDE): 0.3, NOTHING: 0.35}
+    for verdict in (schema.NOTHING_MISSING, schema.UNEXPLAINED):
+        text = headline(summary_of(table, verdict=verdict, ratio=2.0))
+        assert "Something outside the catalogue acts, with probability 0.65." in text
+    once = headline(summary_of({(OUTSIDE,): 0.9, NOTHING: 0.1}, verdict=schema.NOTHING_MISSING))
+    assert once.count("outside the catalogue") == 1
+
+
 def test_the_sum_of_a_class_is_said():
     together = {"effects": [STRIBECK, COULOMB, "dahl_friction @ stroke"], "family": "friction",
                 "probability": 0.993}  # fmt: skip
