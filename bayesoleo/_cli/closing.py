@@ -110,7 +110,10 @@ def _print_proposals(entries: list[dict[str, object]], titles: dict[str, str]) -
 
     console = shell.console()
     if not entries:
-        console.print("Nothing is left to be told apart: one structure is nearly certain.")
+        console.print(
+            "No run is proposed: one structure is nearly certain, most probably nothing is"
+            " missing, or none of the structures that foresee a run is likely."
+        )
     for entry in entries:
         for line in proposal_lines(entry, titles):
             console.print(line, markup=False, highlight=False, soft_wrap=True)

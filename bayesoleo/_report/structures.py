@@ -504,7 +504,7 @@ def _question(entry: Mapping[str, Any]) -> str:
         pairs = zip(entry["rivals"], entry.get("probabilities") or [], strict=False)
         known = [f"{name} ({chance:.2f})" for name, chance in pairs]
         beside = f" beside {listed(entry['shared'])}" if entry["shared"] else ""
-        among = " among these" if entry["note"] else ""
+        among = _among(entry)
         listing = listed(known or entry["rivals"])
         return f"What is missing{beside}, by probability{among}: {listing}."
     if entry["question"] == "indistinguishable":
@@ -513,6 +513,16 @@ def _question(entry: Mapping[str, Any]) -> str:
     if entry["question"] == "open":
         return f"Each of {names} might be what is missing."
     return f"To be told apart: {names}."
+
+
+def _among(entry: Mapping[str, Any]) -> str:
+    """That structures are not all that may be missing, and what they have together."""
+    together = entry.get("probability")
+    if entry["question"] != "structures" or (together or 0.0) > 1.0 - SHOWN:
+        return ""
+    if together is None:  # of results that were stored without it
+        return " among these" if entry["note"] else ""
+    return f" among these, which have {spoken(together)} together"
 
 
 def _answer(entry: Mapping[str, Any]) -> list[str]:
@@ -525,7 +535,8 @@ def _answer(entry: Mapping[str, Any]) -> list[str]:
     gain = "is expected to tell"
     text = f"A run {run_text(best, _scale(entry))} {gain} {best['information']:.2f} bits"
     if best["pairs"]:
-        text += f" of the {entry['entropy']:.2f} that are open"
+        among = " among these" if _among(entry) else ""
+        text += f" of the {entry['entropy']:.2f} that are open{among}"
     else:
         name = _most_improved(entry)[0]
         text += f" and to leave {100 * best['sd_ratio'][name]:.0f} % of the standard deviation"

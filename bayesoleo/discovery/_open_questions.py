@@ -47,6 +47,9 @@ ALIKE, OPEN, ASKED = "indistinguishable", "open", "asked"
 #: A structure that is as probable as this is decided; one that is less probable than that is no
 #: rival.
 DECIDED, LEAST = SURE, 0.01
+#: Structures that together are less probable than this are not worth a run: it is decided that none
+#: of them is true, and what a run tells among them is told with this probability only.
+WORTH_A_RUN = 1.0 - DECIDED
 #: Name of the structure without effects.
 NOTHING = "nothing"
 #: Runs that the summary lists.
@@ -172,6 +175,8 @@ class Question:
         The reason, or the effects that were left out.
     aim : str
         The parameter that is to be more precise; empty for all.
+    probability : float or None
+        Of the rivals together, where structures are to be told apart.
     """
 
     number: int
@@ -180,6 +185,7 @@ class Question:
     proposals: Proposals | None
     note: str = ""
     aim: str = ""
+    probability: float | None = None
 
 
 def questions_of(
@@ -261,7 +267,8 @@ def _of_structures(
     loop: ClosedLoop, structures: StructurePosterior, plan: _Plan
 ) -> tuple[Question, ...]:
     """The question which of the most probable structures is true; none where that is decided, the
-    name of the one effect is certain, or most probably nothing is missing."""
+    name of the one effect is certain, or most probably nothing is missing or none of them is true.
+    """
     if loop.certain:
         return ()
     weights: dict[tuple[Added, ...], float] = {}
@@ -271,8 +278,10 @@ def _of_structures(
     ordered = sorted(weights, key=lambda effects: -weights[effects])
     leading = [e for e in ordered if weights[e] >= LEAST][: plan.numerics.policy.proposal_rivals]
     chosen = leading if len(leading) > 1 else ordered[:2]
-    total = sum(weights.values())
+    total, joint = sum(weights.values()), sum(weights[effects] for effects in chosen)
     if len(chosen) < 2 or weights[chosen[0]] > DECIDED * total or structures.nothing > 0.5 * total:
+        return ()
+    if joint < WORTH_A_RUN:
         return ()
     names = tuple(structure_label(effects, chosen) for effects in chosen)
     number = len(loop.rounds)
@@ -294,13 +303,15 @@ def _of_structures(
             raise ModelError(f"{', '.join(failed)} could not be estimated", hint="name others")
         proposals, unused = plan.proposed(rivals, loop.final.fit_errors)
     except InputError as error:
-        return (Question(number, STRUCTURES, names, None, error.problem),)
+        return (Question(number, STRUCTURES, names, None, error.problem, probability=joint),)
     notes = [f"{name}, which could not be estimated" for name in failed]
-    rest = 1.0 - sum(weights[effects] for effects in chosen)
+    rest = 1.0 - joint
+    joint = sum(rival.weight for rival in rivals)
     if rest > LEAST:
         notes.append(f"other structures, and what predicts nothing (probability {rest:.2f})")
     notes += [unused] if unused else []
-    return (Question(number, STRUCTURES, proposals.rivals, proposals, "; ".join(notes)),)
+    note = "; ".join(notes)
+    return (Question(number, STRUCTURES, proposals.rivals, proposals, note, probability=joint),)
 
 
 def structure_label(effects: Sequence[Added], among: Sequence[Sequence[Added]]) -> str:
@@ -370,6 +381,7 @@ def proposals_entry(question: Question, unit: str) -> dict[str, Any]:
         "parameter": question.aim,
         "rivals": list(question.rivals),
         "probabilities": [] if found is None else list(found.weights),
+        "probability": question.probability,
         "entropy": 0.0 if found is None else found.entropy,
         "note": question.note,
         "drive": found.drive or None if found is not None else None,

@@ -72,6 +72,18 @@ def test_effects_that_all_rivals_have_are_told_once():
     assert question == f"{expected}c (0.50), d (0.30) and nothing more (0.20)."
 
 
+def test_structures_are_told_with_what_they_have_together():
+    """Something outside, which predicts nothing, may have most of the probability."""
+    given = entry(question="structures", probability=0.472)
+    question, answer = proposal_lines(given)
+    expected = "What is missing, by probability among these, which have 0.47 together: "
+    assert question == f"{expected}a (0.60) and b (0.40)."
+    assert "bits of the 0.98 that are open among these; " in answer
+    question, answer, _ = proposal_lines(given | {"probability": 0.999, "note": "limits of x"})
+    assert question == "What is missing, by probability: a (0.60) and b (0.40)."
+    assert "that are open; " in answer
+
+
 def test_three_effects_of_a_rival_are_seen_as_one():
     given = entry(question="structures", rivals=["a + b + c", "d"])
     question = proposal_lines(given)[0]
