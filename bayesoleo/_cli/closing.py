@@ -102,20 +102,23 @@ def propose(
     if as_json:
         shell.print_json({"proposals": entries})
     else:
-        _print_proposals(entries, summary.get("titles", {}))
+        _print_proposals(summary)
 
 
-def _print_proposals(entries: list[dict[str, object]], titles: dict[str, str]) -> None:
+def _print_proposals(summary: Mapping[str, Any]) -> None:
+    from bayesoleo._report.sentences import hold_out_objects
     from bayesoleo._report.structures import proposal_lines, proposal_table
 
     console = shell.console()
+    entries, titles = summary["proposals"], summary.get("titles", {})
+    objection = hold_out_objects(summary)
     if not entries:
         console.print(
             "No run is proposed: one structure is nearly certain, most probably nothing is"
             " missing, or none of the structures that foresee a run is likely."
         )
     for entry in entries:
-        for line in proposal_lines(entry, titles):
+        for line in proposal_lines(entry, titles, objection):
             console.print(line, markup=False, highlight=False, soft_wrap=True)
         content = proposal_table(entry, titles)
         if content is not None:

@@ -445,9 +445,10 @@ def _proposals(
     summary: dict[str, Any], figures: Mapping[str, list[Any]]
 ) -> Iterator[dict[str, Any]]:
     """Sentences, table and figure for each set of effects that is left to be told apart."""
+    objection = sentences.hold_out_objects(summary)
     for number, entry in enumerate(summary.get("proposals", [])):
         yield {
-            "lines": proposal_lines(entry, sentences.titles(summary)),
+            "lines": proposal_lines(entry, sentences.titles(summary), objection),
             "table": proposal_table(entry, sentences.titles(summary)),
             "figures": figures[f"proposal {number}"],
         }

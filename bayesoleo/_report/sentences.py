@@ -244,6 +244,33 @@ def only_too_small(summary: Mapping[str, Any]) -> bool:
     return any(map(too_small, pooled)) and not any(map(too_large, (*pooled, *single)))
 
 
+def hold_out_objects(summary: Mapping[str, Any]) -> str:
+    """That the hold-out runs leave more error than chance allows, as the end of a sentence; empty
+    where they do not.
+
+    Probabilities of structures follow from the fitted runs alone.
+    """
+    single = summary["rounds"][-1].get("error", {})
+    after = summary["error_after"].get(schema.HOLD_OUT, {})
+    pooled = {f"{output} there": errors for output, errors in after.items()}
+    of_runs = {
+        f"{output} in {in_run(run)}": errors
+        for output, runs in single.items()
+        for run, errors in runs.items()
+        if errors.get("role") == schema.HOLD_OUT
+    }
+    for errors in (pooled, of_runs):
+        large = {where: ratio(one) or 0.0 for where, one in errors.items() if too_large(one)}
+        if large:
+            where = max(large, key=lambda one: large[one])
+            times = f"{format_ratio(large[where])} times {words(summary)}"
+            return (
+                "; yet the hold-out runs say that more is missing: the final model's error of"
+                f" {where} is {times}"
+            )
+    return ""
+
+
 def unfinished(summary: Mapping[str, Any]) -> list[str]:
     """Which stages did not finish, and why."""
     return [

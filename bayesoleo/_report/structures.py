@@ -349,7 +349,9 @@ def section(summary: Mapping[str, Any]) -> list[str]:
 MOST_PAIRS = 3
 
 
-def proposal_lines(entry: Mapping[str, Any], titles: Mapping[str, str] | None = None) -> list[str]:
+def proposal_lines(
+    entry: Mapping[str, Any], titles: Mapping[str, str] | None = None, objection: str = ""
+) -> list[str]:
     """What one entry of the summary's ``proposals`` says, sentence by sentence.
 
     Parameters
@@ -358,9 +360,11 @@ def proposal_lines(entry: Mapping[str, Any], titles: Mapping[str, str] | None = 
         As in ``summary.json``.
     titles : mapping of str to str, optional
         Titles of effects by id, besides those of the catalogue.
+    objection : str
+        What the hold-out runs say against the probabilities, as the end of a sentence.
     """
     entry = _with_titles(entry, titles or {})
-    lines = [_question(entry)]
+    lines = [_question(entry, objection)]
     if entry["runs"]:
         lines += _answer(entry)
     elif entry["note"]:
@@ -495,7 +499,7 @@ def _scale(entry: Mapping[str, Any]) -> Scale:
     return engineering(entry["unit"], max(sizes, default=0.0))
 
 
-def _question(entry: Mapping[str, Any]) -> str:
+def _question(entry: Mapping[str, Any], objection: str) -> str:
     names = listed(entry["rivals"])
     if entry["question"] == "parameters":
         what = entry.get("parameter") or "the parameters"
@@ -506,7 +510,7 @@ def _question(entry: Mapping[str, Any]) -> str:
         beside = f" beside {listed(entry['shared'])}" if entry["shared"] else ""
         among = _among(entry)
         listing = listed(known or entry["rivals"])
-        return f"What is missing{beside}, by probability{among}: {listing}."
+        return f"What is missing{beside}, by probability{among}: {listing}{objection}."
     if entry["question"] == "indistinguishable":
         first, *others = entry["rivals"]
         return f"These data cannot tell {first}, which was added, from {listed(others)}."

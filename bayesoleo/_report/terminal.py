@@ -103,8 +103,9 @@ def print_summary(summary: Mapping[str, Any], console: Console) -> None:
             console.print(_accepted(number, entry, titles) + later)
     for line in sentences.remainder(summary):
         console.print(Text(line, style="dim"))
+    objection = sentences.hold_out_objects(summary)
     for entry in summary.get("proposals", []):
-        console.print(Text(" ".join(proposal_lines(entry, titles)[:2]), style="dim"))
+        console.print(Text(" ".join(proposal_lines(entry, titles, objection)[:2]), style="dim"))
     for line in _warnings(summary):
         console.print(Text(line, style="yellow"))
     files = summary.get("files", {})

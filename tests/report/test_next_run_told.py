@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pytest
+
+from bayesoleo._report.sentences import hold_out_objects
 from bayesoleo._report.structures import proposal_lines, proposal_table
 
 
@@ -82,6 +85,28 @@ def test_structures_are_told_with_what_they_have_together():
     question, answer, _ = proposal_lines(given | {"probability": 0.999, "note": "limits of x"})
     assert question == "What is missing, by probability: a (0.60) and b (0.40)."
     assert "that are open; " in answer
+
+
+@pytest.mark.parametrize(("pooled", "single"), [(20.0, 28.0), (1.0, 28.0), (1.0, 1.0)])
+def test_hold_out_runs_that_say_more_is_missing_are_told(pooled, single):
+    """Probabilities follow from the fitted runs alone."""
+
+    def errors(value):
+        return {"ratio_to_noise": value, "limit": 1.2}
+
+    runs = {"a": errors(9.0) | {"role": "fit"}, "e": errors(single) | {"role": "hold-out"}}
+    summary = {
+        "rounds": [{"error": {"angle": runs}}],
+        "error_after": {"fit": {"angle": errors(9.0)}, "hold-out": {"angle": errors(pooled)}},
+    }
+    given = entry(question="structures", rivals=["a", "a + b"])
+    text = proposal_lines(given, objection=hold_out_objects(summary))[0]
+    said = "(0.40); yet the hold-out runs say that more is missing: the final model's error of"
+    assert (said in text) is (single > 1.2)
+    if pooled > 1.2:
+        assert text.endswith("of angle there is 20.0 times its standard error.")
+    elif single > 1.2:
+        assert text.endswith("of angle in run e is 28.0 times its standard error.")
 
 
 def test_three_effects_of_a_rival_are_seen_as_one():
