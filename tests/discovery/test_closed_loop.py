@@ -190,7 +190,7 @@ def test_what_the_hold_out_runs_contradict_is_not_added(tmp_path):
     records = [r if r.role == "fit" else other.record(r.label) for r in rubbing.records]
     loop = close(replace(rubbing, records=tuple(records)), damper())
     assert loop.effects == ()
-    assert "does not lower the error on hold-out" in loop.rounds[0].reason
+    assert "raises the error on hold-out runs: the weighted squared" in loop.rounds[0].reason
 
 
 def test_no_effect_to_look_for_is_no_failure(tmp_path):

@@ -154,6 +154,52 @@ def test_runs_without_a_solution_are_not_said_to_speak_against_an_effect(monkeyp
     assert reason == "play cannot be confirmed: it changes no hold-out run that is solved"
 
 
+ITEM = SimpleNamespace(effect="play", gain=0.5)
+HALF = Fall(500.0, 50.0, 500.0)
+
+
+@pytest.mark.parametrize(
+    ("fall", "other", "said"),
+    [
+        (Fall(324.0, 30.0, 300.0), None,
+         "and lowers the error on hold-out runs: the weighted squared error falls by 324 ± 30"),
+        # Significant although a real effect might have been missed.
+        (Fall(324.0, 30.0, 300.0, 400.0), HALF,
+         "and lowers the error on hold-out runs: the weighted squared error falls by 324 ± 30; on"
+         " the second half of fitted ones it falls by 500 ± 50"),
+        (Fall(32.0, 30.0, 20.0), HALF,
+         "; the error is not significantly different on hold-out runs: the weighted squared error"
+         " falls by 32 ± 30, but these runs would often miss a real effect, which lowers it by 20"
+         " on average; on the second half of fitted ones it falls by 500 ± 50, and both together"
+         " confirm it"),
+        (Fall(-12.0, 30.0, 20.0, 40.0), HALF, "the weighted squared error rises by 12 ± 40, but"),
+    ],
+)  # fmt: skip
+def test_a_confirmation_is_told_by_the_result(fall, other, said):
+    text = confirmation._confirming(ITEM, fall, other)
+    assert text.startswith("play explains 50 % of the excess")
+    assert said in text
+
+
+@pytest.mark.parametrize(
+    ("fall", "other", "said"),
+    [
+        (Fall(90.0, 670.0, 3000.0), None,
+         "play does not lower the error on hold-out runs significantly: the weighted squared error"
+         " falls by 90 ± 670; 1.96 standard errors are required (false alarms 2.5 %)"),
+        (Fall(-1070.0, 150.0, 5000.0, 300.0), None,
+         "play raises the error on hold-out runs: the weighted squared error rises by 1070 ± 300"),
+        (Fall(-400.0, 150.0, 5000.0, 300.0), None, "error rises by 400 ± 300; 1.96 standard"),
+        (Fall(9.0, 14.0, 20.0), Fall(3.0, 5.0, 5.0),
+         "significantly together with the second half of fitted ones: the weighted squared error"
+         " falls by 9 ± 14; on the second half of fitted ones it falls by 3.0 ± 5.0; 1.96"),
+        (Fall(0.25, 0.017, 1.0), None, "1.96 standard errors, and a fall of 3.84 are required"),
+    ],
+)  # fmt: skip
+def test_a_refusal_is_told_by_the_result(fall, other, said):
+    assert said in confirmation._refusing(ITEM, fall, other)
+
+
 def test_a_fall_of_about_its_error_confirms_nothing():
     fall = Fall(324.0, 300.0, 5000.0)
     assert not fall.confirms
