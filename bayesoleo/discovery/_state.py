@@ -130,8 +130,11 @@ class State:
         runs = {p.record.label: p.predictor.runs[0] for p in self.held_out}
         runs = {label: run for label, run in runs.items() if label not in known.runs}
         matrices = [run.anchor.monodromy if run.anchor else None for run in runs.values()]
-        jumps = np.array([run.jumps for run in runs.values()], dtype=np.int64)
-        return known.together(Stability.of(tuple(runs), matrices, jumps))
+        jumps, changes = (
+            np.array([getattr(run, key) for run in runs.values()], dtype=np.int64)
+            for key in ("jumps", "changes")
+        )
+        return known.together(Stability.of(tuple(runs), matrices, jumps, changes))
 
     @property
     def by_role(self) -> dict[str, dict[str, dict[str, float]]]:

@@ -89,6 +89,11 @@ class CampaignProblem:
         """Solutions so far, by run, that left the branch of the one they started from, (N,)."""
         return np.array([run.jumps for run in self.predictor.runs], dtype=np.int64)
 
+    @property
+    def stability_changes(self) -> Integers:
+        """Those of them that changed the stability only, (N,)."""
+        return np.array([run.changes for run in self.predictor.runs], dtype=np.int64)
+
     @contextmanager
     def unwatched(self) -> Iterator[None]:
         """Look for no jumps between branches meanwhile."""
@@ -105,14 +110,14 @@ class CampaignProblem:
     def undisturbed(self) -> Iterator[None]:
         """Evaluate elsewhere meanwhile; solvers then start where they did, on their branch."""
         runs, last = self.predictor.runs, self._last
-        before = [(run.found(), run.jumps) for run in runs]
+        before = [(run.found(), run.jumps, run.changes) for run in runs]
         try:
             with self.unwatched():
                 yield
         finally:
-            for run, (found, jumps) in zip(runs, before, strict=True):
+            for run, (found, jumps, changes) in zip(runs, before, strict=True):
                 run.restore(found)
-                run.jumps = jumps
+                run.jumps, run.changes = jumps, changes
             self._last = last
 
     def full(self, theta: Array) -> Array:

@@ -32,7 +32,12 @@ from bayesoleo.estimation._least_squares import PriorScale, on_limit
 from bayesoleo.estimation._nuisance import with_measured, without_measured
 from bayesoleo.estimation._objectives import Objective, objective_of
 from bayesoleo.estimation._point_estimate import PointEstimate
-from bayesoleo.estimation._problem import EstimationProblem, jumps_of, measured_of
+from bayesoleo.estimation._problem import (
+    EstimationProblem,
+    jumps_of,
+    measured_of,
+    stability_changes_of,
+)
 from bayesoleo.estimation._scipy_methods import MOST_ITERATIONS, PREFIX, run_scipy
 from bayesoleo.prediction._stability import Stability
 from bayesoleo.solvers._orbit import added
@@ -232,7 +237,7 @@ def estimate(
     wanted = objective_of(problem, objective, error_covariance)
     limits = _Limits(tolerance, max_iterations, resolution, bias_corrected, progress)
     found: list[PointEstimate] = []
-    jumps = jumps_of(problem)
+    jumps, changes = jumps_of(problem), stability_changes_of(problem)
     for each in [method] if isinstance(method, str | Step) else method:
         found.append(_one(problem, each, begin, wanted, limits))
         if found[-1].status.ok:
@@ -242,7 +247,10 @@ def estimate(
         best,
         evaluations=sum(point.evaluations for point in found),
         failures=added(point.failures for point in found),
-        stability=best.stability and best.stability.with_jumps(jumps_of(problem) - jumps),
+        stability=best.stability
+        and best.stability.with_jumps(
+            jumps_of(problem) - jumps, stability_changes_of(problem) - changes
+        ),
     )
 
 

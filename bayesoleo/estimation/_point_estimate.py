@@ -159,7 +159,8 @@ class PointEstimate:
         if first is None or first.stability is None or self.stability is None:
             return self
         jumps = self.stability.jumps + first.stability.jumps
-        return replace(self, stability=self.stability.with_jumps(jumps))
+        changes = self.stability.only_changed + first.stability.only_changed
+        return replace(self, stability=self.stability.with_jumps(jumps, changes))
 
     def __str__(self) -> str:
 

@@ -77,6 +77,12 @@ def jumps_of(problem: EstimationProblem) -> Int[Integers, " runs"]:
     return np.asarray(getattr(problem, "branch_jumps", np.zeros(len(problem.runs), np.int64)))
 
 
+def stability_changes_of(problem: EstimationProblem) -> Int[Integers, " runs"]:
+    """Those of them that changed the stability only, shape (N,); zeros where not counted."""
+    none = np.zeros(len(problem.runs), np.int64)
+    return np.asarray(getattr(problem, "stability_changes", none))
+
+
 def unwatched(problem: object) -> AbstractContextManager[None]:
     """Look for no jumps between branches meanwhile, where a problem looks for them.
 
@@ -270,6 +276,11 @@ class Held(SameData):
     def branch_jumps(self) -> Integers:
         """Solutions so far that left their branch, by run, shape (N,)."""
         return jumps_of(self.problem)
+
+    @property
+    def stability_changes(self) -> Integers:
+        """Those of them that changed the stability only, shape (N,)."""
+        return stability_changes_of(self.problem)
 
     def unwatched(self) -> AbstractContextManager[None]:
         """Look for no jumps between branches meanwhile."""

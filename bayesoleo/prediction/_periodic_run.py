@@ -102,9 +102,10 @@ class RunPredictor:
     _by_phase: tuple[Any, FusedOutputs | None] | None = None
     _as_recorded: tuple[Any, FusedOutputs | None] | None = None
 
-    #: Solutions so far that left the branch of the anchor from which they were started, and whether
-    #: they are looked for: where a solution is known, it costs more than the solution.
-    jumps, watched = 0, True
+    #: Solutions so far that left the branch of the anchor from which they were started or changed
+    #: its stability, those that did the latter only, and whether they are looked for: where a
+    #: solution is known, it costs more than the solution.
+    jumps, changes, watched = 0, 0, True
     #: How often a motion may still be sought by shooting; None for any number.
     shots: int | None = None
 
@@ -261,6 +262,7 @@ class RunPredictor:
                     anchor = anchor.after(self.anchor, self.boundary, self.active)
                 self.anchor = anchor
                 self.jumps += anchor.jumped
+                self.changes += anchor.changed
         return Status(int(solution.status[0]))
 
     def solve_from_guess(self, p: Array) -> Solution:
@@ -373,11 +375,14 @@ class RunPredictor:
         left = anchor.left_by(p[:, self.active] - anchor.p[self.active], x) & good
         for lane in np.flatnonzero(left):  # few: those that the prediction misses by far
             left[lane] = not anchor.leads_to(p[lane], x[lane], self.boundary, self.active)
+        changed = np.zeros_like(left)
         if monodromy is not None:
-            left |= good & (unstable_of(monodromy) != anchor.unstable)
+            changed = good & ~left & (unstable_of(monodromy) != anchor.unstable)
+        left |= changed
         if left.any():
             with _COUNTING:
                 self.jumps += int(left.sum())
+                self.changes += int(changed.sum())
         return cast(Flags, left)
 
     def evaluate(self, p: Array) -> PredictedSamples:

@@ -489,6 +489,7 @@ class SolvedRun(RunPredictor):
             self.anchor = replace(anchor, jumped=left)
             self._anchored = self.anchor, found
             self.jumps += left
+            self.changes += left
         return found, status
 
     # -- many ------------------------------------------------------------------------------
@@ -512,6 +513,7 @@ class SolvedRun(RunPredictor):
         if self.anchor is not None and self.watched and samples.monodromy is not None:
             left = (unstable_of(samples.monodromy) != self.anchor.unstable) & (samples.status == 0)
             self.jumps += int(left.sum())
+            self.changes += int(left.sum())
         return replace(samples, jumped=left)
 
     def evaluate(self, p: Array) -> PredictedSamples:

@@ -52,9 +52,15 @@ ELSEWHERE = (
     " answer to the same input"
 )
 JUMPED = (
-    "branch jumps: the periodic solution of {} went to another branch, or changed its stability,"
-    " between neighbouring parameters (how often in brackets): the model has several answers to"
-    " this input, and a fit may follow the wrong one"
+    "branch jumps: the periodic solution of {} went to another branch between neighbouring"
+    " parameters (how often in brackets): the model has several answers to this input, and a fit"
+    " may follow the wrong one"
+)
+CHANGED = (
+    "the periodic solution of {} changed its stability between neighbouring parameters (how often"
+    " in brackets), with no jump to another branch: some of the parameters tried have an unstable"
+    " motion, on which no rig stays. A nonlinear model then has other answers to this input; a"
+    " linear one, which is unstable where a damping is negative, has none"
 )
 
 
@@ -132,15 +138,22 @@ class Stability:
     jumps : ndarray of int, shape (N,)
         How often a run's solution left its branch, or changed the number of multipliers outside the
         unit circle, between parameters that followed each other.
+    changes : ndarray of int, shape (N,), optional
+        How many of these changed that number only; by default none.
     """
 
     runs: tuple[str, ...]
     multipliers: Complex[ComplexArray, "runs states"]
     jumps: Int[Integers, " runs"]
+    changes: Int[Integers, " runs"] | None = None
 
     @classmethod
     def of(
-        cls, runs: Sequence[str], monodromies: Sequence[Array | None], jumps: Integers
+        cls,
+        runs: Sequence[str],
+        monodromies: Sequence[Array | None],
+        jumps: Integers,
+        changes: Integers | None = None,
     ) -> Stability:
         """From the monodromy matrix ``(D, D)`` of each run, where there is one."""
         size = max((m.shape[0] for m in monodromies if m is not None), default=0)
@@ -148,7 +161,7 @@ class Stability:
         for row, matrix in zip(table, monodromies, strict=True):
             if matrix is not None:
                 row[:] = floquet_multipliers(matrix)
-        return cls(tuple(runs), table, jumps)
+        return cls(tuple(runs), table, jumps, changes)
 
     @property
     def unstable(self) -> Integers:
@@ -160,9 +173,14 @@ class Stability:
         """Jumps of all runs."""
         return int(self.jumps.sum())
 
-    def with_jumps(self, jumps: Integers) -> Stability:
-        """Copy with a given number of jumps."""
-        return replace(self, jumps=jumps)
+    @property
+    def only_changed(self) -> Integers:
+        """Jumps of each run at which the number of unstable multipliers changed only."""
+        return np.zeros_like(self.jumps) if self.changes is None else self.changes
+
+    def with_jumps(self, jumps: Integers, changes: Integers) -> Stability:
+        """Copy with a given number of jumps, and of those that changed the stability only."""
+        return replace(self, jumps=jumps, changes=changes)
 
     def as_plain(self) -> dict[str, dict[str, Any]]:
         """Values by run for JSON: multipliers as real and imaginary part; None if unknown."""
@@ -186,6 +204,7 @@ class Stability:
             self.runs + other.runs,
             np.concatenate([self.multipliers, rows]),
             np.concatenate([self.jumps, other.jumps]),
+            np.concatenate([self.only_changed, other.only_changed]),
         )
 
     def notes(self) -> list[str]:
@@ -196,10 +215,12 @@ class Stability:
             if what:
                 found.setdefault(what, []).append(f"{run} ({_spelled(_telling(row))})")
         notes = [what.format(_runs(runs)) for what, runs in found.items()]
-        if self.branch_jumps:
-            counts = zip(self.runs, self.jumps, strict=True)
+        changes = self.only_changed
+        for text, numbers in ((JUMPED, self.jumps - changes), (CHANGED, changes)):
+            counts = zip(self.runs, numbers, strict=True)
             runs = [f"{run} ({number})" for run, number in counts if number]
-            notes.append(JUMPED.format(_runs(runs)))
+            if runs:
+                notes.append(text.format(_runs(runs)))
         return notes
 
 

@@ -488,6 +488,8 @@ class Anchor:
         Of a periodic solution; None for a transient.
     jumped : bool
         Whether it left the branch of the anchor before it, or changed its stability.
+    changed : bool
+        Whether it did the latter only.
     """
 
     p: Float[Array, " constants"]
@@ -495,6 +497,7 @@ class Anchor:
     x_p: Float[Array, "active steps width"]
     monodromy: Float[Array, "states states"] | None = None
     jumped: bool = False
+    changed: bool = False
 
     def predict(self, change: Array) -> Array:
         """Starts, shape (L, n, w), at changes of the active parameters, shape (L, na)."""
@@ -533,7 +536,8 @@ class Anchor:
             return self
         far = old.left_by((self.p - old.p)[active][None], self.x[None])[0]
         left = far and not old.leads_to(self.p, self.x, boundary, active)
-        return replace(self, jumped=bool(left or old.unstable != self.unstable))
+        changed = not left and old.unstable != self.unstable
+        return replace(self, jumped=bool(left or changed), changed=changed)
 
     def leads_to(self, p: Array, x: Array, boundary: Boundary, active: Integers) -> bool:
         """Whether small steps from here to constants ``p (np,)`` arrive at a solution ``x (n, w)``.

@@ -87,7 +87,8 @@ def test_an_estimate_that_falls_off_its_branch_says_so():
     record = settled(duffing(150.0), plan, force, (0.15, 0.0), 1e-3)
     lost = fitted(duffing(100.0), record)
     assert lost.branch_jumps > 0
-    assert "branch jumps: the periodic solution of run a" in str(lost)
+    assert "the periodic solution of run a (" in str(lost)
+    assert "A nonlinear model then has other answers to this input" in str(lost)
     assert lost.to_dataset()["branch_jumps"].sel(run="a") == lost.branch_jumps
     # Started on the measured motion, as records of a campaign are, it comes home without one.
     home = fitted(duffing(100.0), settled(duffing(150.0), plan, force, (0.15, 0.0), 1e-3, 6))

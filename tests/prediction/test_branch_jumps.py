@@ -205,6 +205,31 @@ def test_notes_say_what_would_happen_instead():
     assert found.branch_jumps == 2
 
 
+def test_jumps_and_changes_of_stability_are_told_apart():
+    """A linear model has one answer to an input, which may be unstable."""
+    table = np.full((3, 1), 0.5 + 0j)
+    found = Stability(tuple("abc"), table, np.array([0, 2, 5]), np.array([0, 2, 1]))
+    jumped, changed = found.notes()
+    assert "run c (4) went to another branch" in jumped
+    assert "several answers" in jumped
+    assert "runs b (2), c (1) changed its stability" in changed
+    assert "several answers" not in changed
+    assert "a linear one" in changed
+    both = found.together(found.with_jumps(np.array([1, 0, 0]), np.array([1, 0, 0])))
+    assert both.only_changed.tolist() == [0, 2, 1, 1, 0, 0]
+    assert both.branch_jumps == 8
+
+
+def test_a_linear_model_changes_its_stability_only():
+    made, theta = predictor(110.0, "linear_oscillator")
+    unstable = at(theta, made.layout.names, damping=-theta[made.layout.names.index("damping")])
+    problem = CampaignProblem(made)
+    for vector in (theta, unstable, theta):
+        problem.evaluate(vector)
+    problem.misfit(unstable[None])
+    assert problem.branch_jumps.tolist() == problem.stability_changes.tolist() == [2]
+
+
 def test_what_is_not_known_is_not_unstable():
     assert count_unstable(np.empty((3, 0), dtype=complex)).tolist() == [-1, -1, -1]
     assert count_unstable(np.array([[1.0 + 1e-12, 0.5]], dtype=complex)).tolist() == [0]
