@@ -23,7 +23,7 @@ NOTHING, OUTSIDE = "nothing missing", "something outside the catalogue"
 #: Estimates beside which averages over structures stand.
 COMPARED = ("declared", "final")
 #: Instead of an interval that is withheld; standard deviations in an interval of 90 %.
-NOT_STATED, _WIDTH = "determined poorly", 3.29
+NOT_STATED, _WIDTH = "not stated", 3.29
 #: Structures of the table that are shown before the others are asked for.
 LEAD = 6
 

@@ -47,10 +47,48 @@ UNANSWERED = 0.1
 UNKNOWN, MISSED = 0.15, 0.3
 #: Probabilities outside one end of an interval of 90 % that show it to be false.
 LEAST_TAIL, MOST_TAIL = 0.02, 0.08
-POORLY = (
-    "The data determine this parameter poorly, so that no average over structures is stated. A"
-    " sampled posterior holds what the final model makes of it."
+#: Part of the probability that is as good as all.
+ALL = 0.995
+#: Why no figures are stated: where, what is known there, and why no more.
+WITHHELD = (
+    "{where} {what}, and {why}: no average over structures is stated. A sampled posterior holds"
+    " what the final model makes of it."
 )
+IN_ALL, IN_SOME = "In all structures", "In structures with a tenth of the probability or more"
+BESIDE_OUTSIDE = "Where something outside the catalogue acts"
+POORLY = "the data determine this parameter to worse than a tenth of itself"
+BENT = "the density of this parameter is another than about its estimate"
+RARE = "too many structures share the probability for the model to be followed in each"
+BY_RUN = "it differs there from run to run, along which the model is not followed"
+LONG = "solutions of so long a run take too much time to follow the model along it"
+JOINT = "its prior depends on other parameters, so that the model is not followed along it alone"
+UNSOLVED = "the model cannot be solved over enough of the range that it may have"
+SPARSE = "the solutions of the model that may be spent on it do not suffice"
+PEAKS = "its density has several peaks along the model"
+
+
+@dataclass(frozen=True)
+class _Unknown:
+    """What is not known of a parameter in one structure, and why."""
+
+    probability: float
+    outside: bool
+    what: str
+    why: str
+
+
+def _reason(unknown: Sequence[_Unknown], total: float) -> str:
+    """Why a parameter has no average, by what the structures with most of the probability lack."""
+    lacking = sum(one.probability for one in unknown)
+    outside = sum(one.probability for one in unknown if one.outside)
+    where = IN_ALL if lacking > ALL * total else IN_SOME
+    where = BESIDE_OUTSIDE if outside > ALL * lacking else where
+    weight: dict[tuple[str, str], float] = {}
+    for one in unknown:
+        key = one.what, one.why
+        weight[key] = weight.get(key, 0.0) + one.probability
+    what, why = max(weight, key=lambda key: weight[key])
+    return WITHHELD.format(where=where, what=what, why=why)
 
 
 @dataclass
@@ -142,19 +180,19 @@ def _average(name: str, exact: Sequence[_Exact], total: float) -> AveragedParame
     """
     solved = [one for one in exact if one.solved(name)]
     enough = sum(one.known.probability for one in solved) >= SOLVED * total
-    parts, missing = list[Mixture](), 0.0
+    parts, unknown = list[Mixture](), list[_Unknown]()
     for one in exact:
-        mixtures, answered = one.of(name)
+        mixtures, lacking = one.of(name), one.unknown(name)
         if enough and not one.is_followed:
             mixtures = [solved[0].changed(name, mixture) for mixture in mixtures]
-            answered = True
+            lacking = None
         share = one.known.probability / max(len(mixtures), 1)
         parts += [mixture.scaled(share) for mixture in mixtures]
-        missing += 0.0 if answered else one.known.probability
+        unknown += [] if lacking is None else [lacking]
     if not parts:
         return None
-    if missing > UNANSWERED * total:
-        return AveragedParameter.withheld(POORLY)
+    if sum(one.probability for one in unknown) > UNANSWERED * total:
+        return AveragedParameter.withheld(_reason(unknown, total))
     return Mixture.of(parts).summary()
 
 
@@ -189,9 +227,11 @@ class _Exact:
         self.followed: list[Followed] = []
         #: Values of equal probability of what is determined poorly.
         self.values: dict[int, Array] = {}
+        #: Why others that are determined poorly have none.
+        self.why: dict[int, str] = {}
 
-    def of(self, name: str) -> tuple[list[Mixture], bool]:
-        """Densities of a parameter, or of what it is in each run, and whether they are known."""
+    def of(self, name: str) -> list[Mixture]:
+        """Densities of a parameter, or of what it is in each run."""
         own, mixtures = self.known.numbers(name), []
         for k in own:
             values = self.values.get(k)
@@ -199,7 +239,18 @@ class _Exact:
             mixtures.append(
                 plain if values is None else part_of(1.0 / values.size, values, 0, False)
             )
-        return mixtures, all(k in self.values or not self.poor[k] for k in own)
+        return mixtures
+
+    def unknown(self, name: str) -> _Unknown | None:
+        """What is not known of a parameter; None where its densities are known."""
+        own = self.known.numbers(name)
+        lacking = [k for k in own if self.poor[k] and k not in self.values]
+        if not lacking:
+            return None
+        k = lacking[0]
+        structure, what = self.known.structure, POORLY if self.known.poor[k] else BENT
+        why = self.why.get(k, BY_RUN if self.is_followed else RARE)
+        return _Unknown(structure.probability, structure.outside, what, why)
 
     def solved(self, name: str) -> bool:
         """Whether a parameter's density here is not that about the estimate."""
@@ -252,9 +303,12 @@ class _Exact:
         dear, or says nothing."""
         known, section = self.known, self.at.section(self.known, self.known.about.names[k])
         if not section.able:
+            self.why[k] = LONG if section.is_long else JOINT
             return None
         found = section.density(known.frame, known.about, *self._moments(k))
-        if found is None or not _says(found.grid):
+        lacking = _lacking(None if found is None else found.grid, section.is_spent)
+        if found is None or lacking:
+            self.why[k] = lacking
             return None
         self.followed.append(found)
         return found.grid.values
@@ -284,6 +338,17 @@ def _own(anchor: EstimatedModel, here: LinearisedModel, k: int) -> bool:
     return name not in anchor.fit.problem.nuisances and not offset
 
 
-def _says(found: GridDensity) -> bool:
-    """Whether a density is known well enough to be stated."""
-    return found.unknown < UNKNOWN and found.gap < MISSED and found.modes == 1
+def _lacking(found: GridDensity | None, spent: bool) -> str:
+    """Why a density is not known well enough to be stated; empty where it is.
+
+    Parameters
+    ----------
+    found : GridDensity or None
+    spent : bool
+        Whether no more solutions were allowed: those that are missing say nothing of the model.
+    """
+    if found is None or found.unknown >= UNKNOWN:
+        return SPARSE if spent else UNSOLVED
+    if found.gap >= MISSED:
+        return SPARSE
+    return PEAKS if found.modes != 1 else ""

@@ -137,10 +137,18 @@ class Section:
     @property
     def able(self) -> bool:
         """Whether solutions are cheap, and the parameter's prior is its own."""
-        fit = self.anchor.fit
-        long = any(run.is_long for run in fit.predictor.runs)
         prior = self.start.priors[self.start.names.index(self.name)]
-        return not long and not isinstance(prior, Correlated)
+        return not self.is_long and not isinstance(prior, Correlated)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether solutions are dear."""
+        return any(run.is_long for run in self.anchor.fit.predictor.runs)
+
+    @property
+    def is_spent(self) -> bool:
+        """Whether no more solutions are allowed."""
+        return self.solutions >= MOST_SOLUTIONS or self.budget.left <= 0
 
     def density(
         self, frame: Frame, known: GivenStructure, mean: float, sd: float
@@ -242,8 +250,8 @@ class _Along:
             run.restore(found)
         theta, away = self._moved(self._about(nearest, there), there, place)
         for _ in range(STEPS):
-            allowed = section.solutions < MOST_SOLUTIONS and section.budget.left > 0
-            one = self._evaluated(theta) if allowed and np.isfinite(theta).all() else None
+            allowed = not section.is_spent and np.isfinite(theta).all()
+            one = self._evaluated(theta) if allowed else None
             if one is None:
                 return None
             there, self.about[place] = one, self.frame.about(one.here, self.patterns)

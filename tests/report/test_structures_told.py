@@ -312,8 +312,8 @@ def test_averages_that_are_withheld_say_why():
     summary = {"structures": {"parameters": {"stiffness": one, "slope": {**one, "declared": None}}}}
     table = structures.parameters(summary)
     assert table is not None
-    assert table.rows[0] == ["stiffness", "1.52 ± 0.9", "–", "–", "determined poorly", "kN/m"]
-    assert table.rows[1][1:5] == ["–", "–", "–", "determined poorly"]
+    assert table.rows[0] == ["stiffness", "1.52 ± 0.9", "–", "–", "not stated", "kN/m"]
+    assert table.rows[1][1:5] == ["–", "–", "–", "not stated"]
     assert structures.withheld(summary) == f"stiffness, slope: {reason}"
 
 
