@@ -29,6 +29,9 @@ from bayesoleo.posterior._diagnostics import Samples
 LISTED, MOST_LISTED, OF_A_CLASS, VISIBLE = 0.99, 20, 2, 0.01
 #: Standard deviations on either side of an estimate that hold 95 %.
 _BOUND = 1.96
+#: Part of the draws that may be of another answer of the model before that is said. A part changes
+#: the probability beyond an end of a 95 % interval by itself at most: 2.5 % to 1.5 or 3.5 %.
+MIXED = 0.01
 #: Draws for each of several parameters whose region is asked for.
 MANY = 10
 
@@ -400,10 +403,11 @@ def _sampler_notes(samples: Samples | None) -> list[str]:
     if samples is None:
         return []
     notes = [f"sampler: {samples.warning}"] if samples.warning else []
-    if samples.branch_jumps:
+    if samples.jumped_part > MIXED:
         notes.append(
             f"sampler: {samples.branch_jumps} solutions of runs left the branch of the estimate, in"
-            f" {samples.evaluations} evaluations: the posterior mixes several answers of the model"
+            f" {samples.evaluations} evaluations, which may be {100 * samples.jumped_part:.2g} % of"
+            " the draws: the posterior may mix several answers of the model"
         )
     return notes
 

@@ -188,7 +188,9 @@ class Samples:
         column for each :class:`~bayesoleo.solvers.Status` that is a failure.
     branch_jumps : int
         Solutions of runs, warm-up included, that left the branch of the one they started from.
-        Where there are any, the density may be that of several answers of the model to one input.
+    jumped_part : float
+        Those among the kept draws' proposals over the accepted ones: were all of them accepted,
+        the density would be that of other answers of the model to this part.
     """
 
     names: tuple[str, ...]
@@ -208,6 +210,7 @@ class Samples:
     reached: bool
     warning: str
     branch_jumps: int = 0
+    jumped_part: float = 0.0
     failed: Int[Integers, "_draws reasons"] = field(
         default_factory=lambda: np.zeros((0, len(REASONS)), dtype=np.int64)
     )

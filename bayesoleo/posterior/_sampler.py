@@ -465,6 +465,7 @@ def _samples(
         evaluations=sum(s.evaluations for s in segments),
         failures=dict(sum((s.failures for s in segments), start=Counter[str]())),
         branch_jumps=sum(s.branch_jumps for s in segments),
+        jumped_part=min(1.0, sum(s.branch_jumps for s in kept) / max(accepted.total(), 1)),
         failed=failed.reshape(draws, every, -1).sum(axis=1),
         reached=not short,
         warning="; ".join(short),

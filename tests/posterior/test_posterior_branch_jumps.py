@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from kill_target import run
 from posterior_targets import Gaussian
 
+from bayesoleo.discovery._summary import _sampler_notes
 from bayesoleo.model._priors import Normal
 from bayesoleo.posterior import LogDensity, to_datasets
 
@@ -29,11 +32,25 @@ def test_jumps_are_counted_and_outlive_a_restart(tmp_path):
     # The search for other modes looks far beyond what is sampled: its jumps say nothing of that.
     first = run(target, tmp_path, climbs=0)
     assert first.branch_jumps == target.branch_jumps > 0
+    # Of a normal density 2.3 % lie beyond two; proposals that are refused count too.
+    assert 0.01 < first.jumped_part < 0.1
     again = Jumping()
-    assert run(again, tmp_path, climbs=0).branch_jumps == first.branch_jumps
+    resumed = run(again, tmp_path, climbs=0)
+    assert resumed.branch_jumps == first.branch_jumps
+    assert resumed.jumped_part == first.jumped_part
     assert again.branch_jumps == 0
     groups = to_datasets(first, (Normal(0, 1), Normal(0, 1)))
     assert groups["sample_stats"].attrs["branch_jumps"] == first.branch_jumps
+
+
+@pytest.mark.parametrize(("part", "told"), [(0.0, False), (1e-4, False), (0.03, True)])
+def test_jumps_are_told_where_they_may_move_an_interval(part, told):
+    """One of thousands of solutions mixes no answers."""
+    samples = SimpleNamespace(warning="", branch_jumps=25, evaluations=17513, jumped_part=part)
+    notes = _sampler_notes(samples)
+    assert len(notes) == told
+    if told:
+        assert "may be 3 % of the draws: the posterior may mix several answers" in notes[0]
 
 
 class Watching(Gaussian):
