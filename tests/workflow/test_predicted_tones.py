@@ -17,7 +17,8 @@ def with_tone(x, v, t):
 
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory):
-    folder = damper_campaign(tmp_path_factory.mktemp("tone"), with_tone, noise=NOISE)
+    folder = tmp_path_factory.mktemp("tone")
+    damper_campaign(folder, with_tone, noise=NOISE)
     return bo.load_campaign(folder, progress=False)
 
 
