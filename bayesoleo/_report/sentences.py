@@ -123,7 +123,7 @@ def _nothing_added(summary: Mapping[str, Any]) -> str:
         text = f"Nothing was added: {explains}; but that nothing is missing has probability {p}."
         return text + structures.outside_unsaid(summary, found["nothing"])
     lead = "No verdict" if only_too_small(summary) else structures.lead_of_unexplained(summary)
-    outside = structures.outside_unsaid(summary)
+    outside = "" if summary.get("slow_noise") else structures.outside_unsaid(summary)
     return f"{lead}: {_size_left(summary)}{_unexplained(summary)}.{outside}"
 
 

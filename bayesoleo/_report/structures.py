@@ -187,6 +187,8 @@ def beside_outside(summary: Mapping[str, Any]) -> str:
 def lead_of_unexplained(summary: Mapping[str, Any]) -> str:
     """Beginning of the headline where an error is left and nothing was added."""
     found, lead = known(summary), "Something is missing"
+    if summary.get("slow_noise"):
+        return "Slow noise is left, or something is missing"
     if found is None:
         return lead
     if found["only_outside"] >= LIKELY:

@@ -166,7 +166,7 @@ def colour_of(lines: Sequence[Lines]) -> tuple[tuple[float, float], float]:
     def cost(x: Array) -> float:
         share, total = MOST_SHARE * float(expit(x[0])), 0.0
         for one in lines:
-            density = _spectrum(one.angle, share, one.step / (step * float(np.exp(x[1]))))
+            density = spectrum_of_process(one.angle, share, one.step / (step * float(np.exp(x[1]))))
             level = np.mean(one.power / density)  # each run's own variance
             total += float(np.sum(np.log(density * level) + one.power / (density * level)))
         return total
@@ -181,7 +181,7 @@ def colour_of(lines: Sequence[Lines]) -> tuple[tuple[float, float], float]:
     return (share, step * float(np.exp(best.x[1]))), p_value
 
 
-def _spectrum(angle: Array, share: float, steps: float) -> Array:
+def spectrum_of_process(angle: Array, share: float, steps: float) -> Array:
     """Spectrum of unit-variance noise of which a share decays by ``exp(-steps)`` per sample."""
     a = np.exp(-steps)
     process = -np.expm1(-2 * steps) / (1 - 2 * a * np.cos(angle) + a * a)

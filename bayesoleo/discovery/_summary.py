@@ -17,6 +17,7 @@ from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._round import Round
 from bayesoleo.discovery._score_basis import squared_distance
 from bayesoleo.discovery._score_tests import Score
+from bayesoleo.discovery._slow_noise import slow_noise, slow_noise_text
 from bayesoleo.discovery._state import State
 from bayesoleo.discovery._structures import Structure, StructurePosterior, total_probability
 from bayesoleo.effects._catalogue import titles_for, with_titles
@@ -62,6 +63,7 @@ def summarise(
     final, stability, titles = loop.final, loop.final.stability, titles_of(loop)
     facts = CurveFacts.of(final) if facts is None else facts
     parameters = _parameters(final, samples, facts.shared)
+    slow = slow_noise(final)
     summary = {
         **about,
         "rounds": [_round(item, titles) for item in loop.rounds],
@@ -98,8 +100,10 @@ def summarise(
                 )
             ),
             *_input_noise_notes(final),
+            *([slow_noise_text(slow)] if slow else []),
             *_sampler_notes(samples),
         ],
+        "slow_noise": slow,
     }
     clean = _finite(summary)
     schema.validate_summary(clean)
