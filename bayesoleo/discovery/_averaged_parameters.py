@@ -65,6 +65,13 @@ JOINT = "its prior depends on other parameters, so that the model is not followe
 UNSOLVED = "the model cannot be solved over enough of the range that it may have"
 SPARSE = "the solutions of the model that may be spent on it do not suffice"
 PEAKS = "its density has several peaks along the model"
+EXCLUDED = (
+    "Figures about the estimates lead to values of this parameter that its prior excludes: no"
+    " average over structures is stated. A sampled posterior holds what the final model makes of"
+    " it."
+)
+#: Fall of a prior's log density that excludes a value: six standard deviations of a normal prior.
+EXCLUDING = 18.0
 
 
 @dataclass(frozen=True)
@@ -193,7 +200,25 @@ def _average(name: str, exact: Sequence[_Exact], total: float) -> AveragedParame
         return None
     if sum(one.probability for one in unknown) > UNANSWERED * total:
         return AveragedParameter.withheld(_reason(unknown, total))
-    return Mixture.of(parts).summary()
+    found = Mixture.of(parts).summary()
+    return AveragedParameter.withheld(EXCLUDED) if _is_excluded(name, exact, found) else found
+
+
+def _is_excluded(name: str, exact: Sequence[_Exact], found: AveragedParameter) -> bool:
+    """Whether an interval reaches to where a prior leaves nothing, although no estimate does.
+
+    A structure's outputs are linear about the estimate of another one only so far.
+    """
+    assert found.low is not None
+    assert found.high is not None
+    every = [(one.known.here, k) for one in exact for k in one.known.numbers(name)]
+    prior = every[0][0].priors[every[0][1]]
+    places = np.array([*(here.theta[k] for here, k in every), found.low, found.high])
+    low, high = prior.support
+    with np.errstate(all="ignore"):
+        falls = prior.log_density(prior.mean) - prior.log_density(places)
+    falls = np.where((places > low) & (places < high), falls, np.inf)
+    return bool(np.max(falls[-2:]) > EXCLUDING + max(float(np.max(falls[:-2])), 0.0))
 
 
 @dataclass

@@ -9,7 +9,8 @@ import pytest
 
 from bayesoleo.discovery import _averaged_parameters as averaged
 from bayesoleo.discovery._adaptive_grid import FINE, GridDensity
-from bayesoleo.discovery._structures import Structure
+from bayesoleo.discovery._structures import AveragedParameter, Structure
+from bayesoleo.model import Normal
 
 
 def exact(probability, outside, *, poor=True, bent=False, followed=False, why=None):
@@ -51,6 +52,21 @@ def test_each_reason_has_its_text():
     assert "worse than a tenth" not in bent
     # Of several that with most of the probability.
     assert averaged.RARE in reason_of(exact(0.6, False), exact(0.4, False, followed=True))
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "estimate", "excluded"),
+    [
+        (14.9, 15.1, 15.0, False),
+        (-770.0, 20.0, 15.0, True),  # a linear model carried on far beyond the estimates
+        (90.0, 91.0, 90.5, False),  # the data contradict the prior, and an estimate lies there
+    ],
+)
+def test_an_interval_that_only_continuation_reaches_is_not_stated(low, high, estimate, excluded):
+    one = exact(1.0, False, poor=False)
+    one.known.here = SimpleNamespace(theta=np.array([estimate]), priors=(Normal(12.0, 12.0),))
+    found = AveragedParameter(estimate, 1.0, low, high, estimate)
+    assert averaged._is_excluded("damping", [one], found) == excluded
 
 
 def grid(unknown=0.0, gap=0.0, modes=1):
