@@ -174,7 +174,8 @@ def predict(
     given = [name for name, c in campaign.campaign.channels.items() if c.bandwidth is not None]
     chosen, _ = without_invented(used, chosen, given)
     kinds = [kind for kind in disturbances if kind != "drift"]
-    chosen = without_disturbances(chosen, list(used.outputs), kinds)
+    measured = [name for name in used.outputs if name in campaign.campaign.channels]
+    chosen = without_disturbances(chosen, measured, kinds)
     removed = removed_text(chosen, campaign.campaign.units)
     added = baselines_in(tree[schema.POINT].to_dataset()) if common_offset else []
     if common_offset:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from small_campaigns import damper, damper_campaign, spring_damper_force
 
 import bayesoleo as bo
+from bayesoleo.errors import CampaignError
+from bayesoleo.model import Output
 
 NOISE, TONE = 0.1, 0.6
 
@@ -39,3 +43,9 @@ def test_it_stays_where_that_is_asked_for(fit, campaign):
     found = fit.predict(campaign, disturbances=())
     assert (found.data["rms"] > 3 * NOISE).all()
     assert "removed" not in str(found)
+
+
+def test_an_output_that_nobody_measured_is_named(fit, campaign):
+    other = replace(damper(), outputs={"torque": Output("1.0*displacement", "N*m")})
+    with pytest.raises(CampaignError, match="needs channel 'torque', which the campaign lacks"):
+        fit.predict(campaign, model=other)
