@@ -6,12 +6,13 @@ Commands import what they need when they run, so that ``--help`` comes at once.
 from __future__ import annotations
 
 import os
+import sys
 from typing import Annotated
 
 import typer
 
 from bayesoleo._cli import assessing, closing, listing, records, steps
-from bayesoleo._cli.shell import Commands, flowing
+from bayesoleo._cli.shell import UNUSABLE, Commands, complain, flowing, machine_text
 from bayesoleo._parallel import ONE_THREAD
 
 __all__ = ["app", "main"]
@@ -86,4 +87,11 @@ def main() -> None:
     """
     if not any(name in os.environ for name in ONE_THREAD):
         os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-    app()
+    try:
+        app()
+    except (MemoryError, ImportError) as error:  # before a command is begun: it answers for itself
+        text = machine_text(error)
+        if not text:
+            raise
+        complain(f"error: {text}")
+        sys.exit(UNUSABLE)

@@ -12,7 +12,7 @@ import warnings
 
 import pytest
 
-from bayesoleo import _worker_processes as processes, _workflow as workflow
+from bayesoleo import _cli, _worker_processes as processes, _workflow as workflow
 from bayesoleo._cli import shell
 from bayesoleo.errors import DataWarning, InputError, ModelError
 
@@ -53,6 +53,24 @@ def test_too_small_a_limit_of_memory_is_named_before_libraries_meet_it():
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("error: not enough memory: a limit of 300 MB is set")
     assert done.stderr.count("\n") == 1
+
+
+def test_a_library_without_room_before_a_command_begins_is_named(monkeypatch, capsys):
+    def full():
+        raise ImportError("x.so: failed to map segment from shared object")
+
+    monkeypatch.setattr(_cli, "app", full)
+    with pytest.raises(SystemExit) as stop:
+        _cli.main()
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.startswith("error: not enough memory: a library cannot be")
+
+    def other():
+        raise ImportError("no such module")
+
+    monkeypatch.setattr(_cli, "app", other)
+    with pytest.raises(ImportError, match="no such module"):
+        _cli.main()
 
 
 def test_no_limit_or_a_large_one_is_no_error(monkeypatch):
