@@ -33,8 +33,8 @@ def slow_noise(state: State) -> dict[str, float]:
     Parameters
     ----------
     state : State
-        The final model. Only outputs are judged whose error exceeds what is expected in some run,
-        and in transients alone.
+        The final model. Outputs are judged whose error exceeds what is expected in some run; where
+        one of them shows more than slow noise, nothing is left open.
     """
     found: dict[str, float] = {}
     for b, output in enumerate(state.fit.predictor.outputs):
@@ -44,13 +44,16 @@ def slow_noise(state: State) -> dict[str, float]:
             if e.output == output and not e.ratio_to_expected < limit([e], policy=state.policy)
         }
         chosen = [p for p in (*state.fitted, *state.held_out) if p.record.label in beyond]
-        if not chosen or any(p.record.periodic or not p.status.ok for p in chosen):
+        if not chosen:
             continue
+        if any(p.record.periodic or not p.status.ok for p in chosen):
+            return {}
         lines = [_lines(one, b, output) for one in chosen]
         length = min(float(one.record.time[-1] - one.record.time[0]) for one in chosen)
         time = _time_of(lines)
-        if time is not None and TIMES * time < length:
-            found[output] = time
+        if time is None or not TIMES * time < length:
+            return {}
+        found[output] = time
     return found
 
 

@@ -165,7 +165,7 @@ def _together(loop: ClosedLoop, found: StructurePosterior) -> float | None:
     own = set(loop.added)
     if not own or not own <= found.effects.keys():
         return None
-    return sum(one.probability for one in found.structures if own <= set(one.effects))
+    return total_probability(one for one in found.structures if own <= set(one.effects))
 
 
 def _averages(loop: ClosedLoop, found: StructurePosterior) -> dict[str, Any]:
