@@ -40,6 +40,7 @@ from scipy.special import logsumexp, ndtr, ndtri
 
 from bayesoleo import _schema as schema
 from bayesoleo._types import Array, Integers
+from bayesoleo.error_models._alone_mixture import Components, moments_of
 from bayesoleo.error_models._base import (
     ErrorModel,
     Frame,
@@ -132,6 +133,31 @@ class Linearised:
     shift: Array
     covariance: Array
     groups: tuple[tuple[float, Array, Array], ...] = ()
+
+
+@dataclass(frozen=True)
+class _Apart:
+    """Products over runs, as if these had nothing in common, and of what they have.
+
+    Parameters
+    ----------
+    total : ndarray, shape (k, k)
+        ``C V^-1 C'``.
+    logs : float
+        ``ln |V|``.
+    inner, cross : ndarray, shapes (R, R) and (k, R)
+        Of the columns of what runs share with each other, and with the rows.
+    """
+
+    total: Array
+    logs: float
+    inner: Array
+    cross: Array
+
+    def shared_with(self, deviation: Array) -> tuple[Array, float, Shared]:
+        """Both with coefficients in common, of prior deviations (R,), and what is known of them."""
+        shared = Shared.of(self.inner, self.cross, deviation)
+        return self.total - shared.half @ shared.half.T, self.logs + 2 * shared.log_root, shared
 
 
 class CatalogueErrors(ErrorModel):
@@ -357,6 +383,11 @@ class CatalogueErrors(ErrorModel):
         Without effects that act alone.
         """
         rho, remainder, effects = (part[0] for part in sizes)
+        known = self._apart(rows, rho, remainder)
+        return known.shared_with(self._deviation(rho, remainder, effects))
+
+    def _apart(self, rows: Sequence[Rows], rho: Array, remainder: float) -> _Apart:
+        """The same of runs that have nothing in common: what no size of an effect changes."""
         count, size = self._variances.size, self._shared.shape[-1]
         number, logs = len(rows[0].along), 0.0
         total, cross = np.zeros((number, number)), np.zeros((number, size))
@@ -367,11 +398,12 @@ class CatalogueErrors(ErrorModel):
             total += (one.gram + (one.along * gain) @ one.along.T) / scale
             cross += ((one.along * gain) @ part.shared) / scale
             cross[:, :count] += one.across / scale
-            inner += part.shared.T * gain @ part.shared / scale
+            # A product of a table with itself takes half the work.
+            half = part.shared * np.sqrt(gain / scale)[:, None]
+            inner += half.T @ half
             inner[:count, :count] += self._grams[one.run, one.output] / scale
             logs += len(part.table) * float(np.log(scale)) - float(np.sum(np.log(gain)))
-        shared = Shared.of(inner, cross, self._deviation(rho, remainder, effects))
-        return total - shared.half @ shared.half.T, logs + 2 * shared.log_root, shared
+        return _Apart(total, logs, inner, cross)
 
     def _deviation(self, rho: Array, remainder: Array, effects: Array) -> Array:
         """Prior deviations of what runs share, (R,), in units of the frozen noise."""
@@ -406,16 +438,23 @@ class CatalogueErrors(ErrorModel):
         Patterson and Thompson (1971), Biometrika 58, 545-554 (restricted likelihood).
         """
         found = self._over_sizes(sensitivity, residual, precision, pull)
-        none = float(found[0][0][0])
-        height = np.concatenate([one[0] for one in found])
-        height = height - np.log(len(found))
+        heights = np.stack([one.heights for one in found]) - np.log(len(found))
         # Without anything but noise: the first component, which is no evidence of more.
-        more = float(logsumexp(height[1:])) - none
-        weight = np.exp(height - logsumexp(height)).reshape(len(found), -1)
-        mean = np.stack([one[1] for one in found])
-        spread = np.stack([one[2] for one in found])
-        _, centre, covariance = _moments(weight, mean, spread)
-        return Linearised(more, centre, covariance, _grouped(weight, mean, spread))
+        more = float(logsumexp(heights.ravel()[1:])) - float(found[0].heights[0])
+        _, centre, covariance = moments_of(found, np.exp(heights - logsumexp(heights)))
+        return Linearised(more, centre, covariance, self._grouped(found, heights))
+
+    def _grouped(
+        self, found: Sequence[Components], heights: Array
+    ) -> tuple[tuple[float, Array, Array], ...]:
+        """Moments of each of the likeliest effects that act alone, and of all else."""
+        weights, count = np.exp(heights - logsumexp(heights)), len(self._alone)
+        effect = np.concatenate([[-1], np.repeat(np.arange(count), ALONE)])
+        by_effect = np.bincount(effect[1:], weights[:, 1:].sum(axis=0), count)
+        likely = np.argsort(-by_effect, kind="stable")[:GROUPS]
+        likely = likely[by_effect[likely] > LEAST_GROUP]
+        group = np.where(np.isin(effect, likely), effect, -1)
+        return tuple(moments_of(found, np.where(group == k, weights, 0.0)) for k in (-1, *likely))
 
     def log_evidence(self, residual: Sequence[Sequence[Array]]) -> float:
         """Logarithm of the evidence of residuals whose unknowns are known, up to a constant.
@@ -428,7 +467,7 @@ class CatalogueErrors(ErrorModel):
         """
         none = [[np.empty((0, one.size)) for one in row] for row in residual]
         found = self._over_sizes(none, residual, np.empty((0, 0)), np.empty(0))
-        return float(logsumexp(np.concatenate([heights for heights, _, _ in found])))
+        return float(logsumexp(np.concatenate([one.heights for one in found])))
 
     def _over_sizes(
         self,
@@ -436,32 +475,26 @@ class CatalogueErrors(ErrorModel):
         residual: Sequence[Sequence[Array]],
         precision: Array,
         pull: Array,
-    ) -> list[tuple[Array, Array, Array]]:
+    ) -> list[Components]:
         """The components at each size of the remainder and of effects, both zero first."""
         both = {
             r: [np.vstack([j, e]) for j, e in zip(columns, left, strict=True)]
             for r, (columns, left) in enumerate(zip(sensitivity, residual, strict=True))
         }
         rows, count = self._rows(both), int(self.frame.counts.sum())
-        return [
-            self._components(rows, count, g, a, precision, pull)
-            for g in (0.0, *REMAINDERS)
-            for a in (0.0, *(EFFECTS if self._variances.size else ()))
-        ]
+        one, found = np.ones(len(self.frame.outputs)), []
+        for remainder in np.square((0.0, *REMAINDERS)):
+            known = self._apart(rows, one, remainder)
+            for effects in np.square((0.0, *(EFFECTS if self._variances.size else ()))):
+                parts = known.shared_with(self._deviation(one, remainder, effects))
+                found.append(self._components(parts, count, precision, pull))
+        return found
 
     def _components(
-        self,
-        rows: Sequence[Rows],
-        count: int,
-        remainder: float,
-        effects: float,
-        precision: Array,
-        pull: Array,
-    ) -> tuple[Array, Array, Array]:
-        """Log evidence (c,), means (c, l) and covariances (c, l, l) at sizes over the noise."""
-        one = np.ones((1, len(self.frame.outputs)))
-        sizes = (one, np.array([remainder**2]), np.array([effects**2]))
-        gram, logs, shared = self._products(rows, sizes)
+        self, parts: tuple[Array, float, Shared], count: int, precision: Array, pull: Array
+    ) -> Components:
+        """The components at one size of the remainder and of effects, over the noise."""
+        gram, logs, shared = parts
         covariance = np.linalg.inv(gram[:-1, :-1] + precision)
         right = gram[:-1, -1] + pull
         mean = covariance @ right
@@ -469,27 +502,24 @@ class CatalogueErrors(ErrorModel):
         logs = logs - float(np.linalg.slogdet(covariance)[1])
         start = -0.5 * (count * np.log(left) + logs) + np.log(0.5 if len(self._alone) else 1.0)
         if not len(self._alone):
-            return np.array([start]), mean[None], covariance[None] * left / count
+            nothing = np.empty((0, ALONE))
+            return Components(
+                np.array([start]), mean, covariance, left / count, np.empty((mean.size, 0)),
+                nothing, nothing, nothing,
+            )  # fmt: skip
         own, cross = shared.along(self._alone)
         turned = covariance @ cross[:-1]
         information = np.maximum(own - np.sum(cross[:-1] * turned, axis=0), 0.0)[:, None]
         score = (cross[-1] - cross[:-1].T @ mean)[:, None]
         gain = self._alone_squares / (1 + self._alone_squares * information)
         rest = np.maximum(left - gain * score**2, 1e-300)
-        height = self._log_odds[:, None] - 0.5 * (
+        heights = self._log_odds[:, None] - 0.5 * (
             count * np.log(rest) + logs + np.log1p(self._alone_squares * information)
         )
-        means = mean - (gain * score)[..., None] * turned.T[:, None]
-        outer = np.einsum("lk,mk->klm", turned, turned)[:, None] * gain[..., None, None]
-        spread = (covariance + outer) * (rest / count)[..., None, None]
-        size = len(mean)
-        return (
-            np.append(start, height.ravel()),
-            np.concatenate([mean[None], means.reshape(height.size, size)]),
-            np.concatenate(
-                [covariance[None] * left / count, spread.reshape(height.size, size, size)]
-            ),
-        )
+        return Components(
+            np.append(start, heights.ravel()), mean, covariance, left / count, turned,
+            gain * score, gain, rest / count,
+        )  # fmt: skip
 
     # -- start, and draws --------------------------------------------------------------------
 
@@ -623,35 +653,6 @@ class CatalogueErrors(ErrorModel):
         else:
             position = since / since[-1] if since[-1] > 0 else since
         return self._signatures.at(run, position, periodic)
-
-
-def _moments(weight: Array, mean: Array, spread: Array) -> tuple[float, Array, Array]:
-    """Weight, mean and covariance of a mixture with weights (...), means (..., l), covariances."""
-    total = float(weight.sum())
-    part = weight.ravel() / max(total, 1e-300)
-    means = mean.reshape(part.size, -1)
-    centre = part @ means
-    away = (means - centre) * np.sqrt(part)[:, None]
-    within = np.tensordot(part, spread.reshape(part.size, *spread.shape[-2:]), 1)
-    return total, centre, np.asarray(within + away.T @ away)
-
-
-def _grouped(weight: Array, mean: Array, spread: Array) -> tuple[tuple[float, Array, Array], ...]:
-    """Moments of each of the likeliest effects that act alone, and of all else.
-
-    Components ``(sizes, 1 + q ALONE)`` have no effect that acts alone first, then one effect at
-    each of its sizes.
-    """
-    count = (weight.shape[1] - 1) // ALONE
-    effect = np.repeat(np.arange(count), ALONE)
-    by_effect = np.bincount(effect, weight[:, 1:].sum(axis=0), count)
-    likely = np.argsort(-by_effect, kind="stable")[:GROUPS]
-    likely = likely[by_effect[likely] > LEAST_GROUP]
-    group = np.append(-1, np.where(np.isin(effect, likely), effect, -1))
-    return tuple(
-        _moments(weight[:, group == k], mean[:, group == k], spread[:, group == k])
-        for k in (-1, *likely)
-    )
 
 
 def _none(frame: Frame) -> Signatures:
