@@ -296,7 +296,7 @@ class Settings:
         min=8, metavar="N", show_default="refined until the estimate stays",
     )  # fmt: skip
     max_effects: int = _setting(
-        4, int, MISSING, "Add at most this many effects.", min=0, metavar="N"
+        6, int, MISSING, "Add at most this many effects.", min=0, metavar="N"
     )
     drive: str | None = _setting(
         None, str | None, SOLVING, "Channel that drives the model; 'model' keeps its own inputs.",

@@ -296,7 +296,7 @@ def close_loop(
     *,
     effects: Sequence[Effect] | None = None,
     seed: int = 0,
-    max_effects: int = 4,
+    max_effects: int = 6,
     nonparametric: bool = True,
     known: Progress | None = None,
     prior: StructurePrior = DEFAULT_PRIOR,

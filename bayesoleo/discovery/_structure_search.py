@@ -42,6 +42,7 @@ from bayesoleo.discovery._structure_comparison import (
     Comparison,
     Evidences,
     Key,
+    Reached,
     best_alone,
     evidences_about,
 )
@@ -108,19 +109,26 @@ class Evidence:
         options = [s.option for s in (*self.comparison.scores, *self.comparison.later)]
         self._shaped = {option.key for option in options if option.candidate.shapes}
 
-    def add(self, anchor: EstimatedModel) -> None:
-        """Compare structures about one more estimated model; the declared one comes first.
+    def add(self, *anchors: EstimatedModel, jobs: int | None = 1) -> None:
+        """Compare structures about more estimated models; the declared one comes first, alone.
 
         Where several anchors reach a structure, the one that has more of its effects counts, and
-        of those the one with the larger evidence: it is better linearised.
+        of those the one with the larger evidence: it is better linearised. About different anchors
+        evidence is computed on so many threads.
         """
-        if not set(anchor.effects) <= set(self.comparison.families):
-            return  # it has effects that were not scored, such as a curve
+        # One that has effects that were not scored, such as a curve, is left out.
+        known = [one for one in anchors if set(one.effects) <= set(self.comparison.families)]
+        for anchor, reached in zip(known, thread_map(self._reached, known, jobs), strict=True):
+            self._take(anchor, reached)
+
+    def _reached(self, anchor: EstimatedModel) -> Reached:
         # What cannot be computed about a poor estimate is no number; the rest counts.
         with np.errstate(all="ignore"):
-            reached = evidences_about(
+            return evidences_about(
                 anchor, self.comparison, self.columns, self._chosen, self._curves
             )
+
+    def _take(self, anchor: EstimatedModel, reached: Reached) -> None:
         result, curves = reached.structures, reached.curves
         own = frozenset(anchor.effects)
         if not np.isfinite([result[own, False], result[own, True]]).all():
@@ -322,8 +330,7 @@ def structure_posterior(
     evidence = Evidence(replace(comparison, later=later))
     declared = EstimatedModel(base.fit, {})
     evidence.add(declared)
-    for grown, fit in known:
-        evidence.add(_anchor(grown, fit, by_key))
+    evidence.add(*(_anchor(grown, fit, by_key) for grown, fit in known), jobs=numerics.jobs)
     tried: set[tuple[Added, ...]] = set()
     ground = Ground(base, assembly, by_key, numerics)
     for _ in range(TIMES):
@@ -337,9 +344,8 @@ def structure_posterior(
         callback(f"estimate {len(chosen)} structures")
         tried |= set(chosen)
         starts = [(effects, evidence.nearest(effects, declared)) for effects in chosen]
-        for found in process_map(extended, ground, starts, numerics.jobs, known=_records_of):
-            if found is not None:
-                evidence.add(found)
+        found = process_map(extended, ground, starts, numerics.jobs, known=_records_of)
+        evidence.add(*(one for one in found if one is not None), jobs=numerics.jobs)
     return evidence.posterior()
 
 

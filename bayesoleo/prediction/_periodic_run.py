@@ -44,10 +44,10 @@ CHUNK = 8
 FEW_STEPS = 1024
 #: Damped steps of Newton's method from a predicted motion, in a first attempt, and undamped ones
 #: after it, before it has as many damped ones as ever: damped steps are caught between the kinks of
-#: friction with clearance. Smooth motions converge in two. About an estimate of such friction, 10
-#: damped ones solve half of the vectors, 4 of them 38 %, and 40 solve 85 % in 2.6 times as long; 200
-#: undamped ones leave one in 100, and after 4 damped ones a density takes 0.86 times as long as
-#: after 10.
+#: friction with clearance. Smooth motions converge in two. About an estimate of such friction, 4
+#: damped ones solve 38 % of the vectors, 10 solve half, and 40 solve 85 % in 2.6 times as long; 200
+#: undamped ones leave one in 100. After 4 damped ones a density takes 0.86 times as long as after
+#: 10.
 FIRST_DAMPED, WHOLE_STEPS, DAMPED_STEPS = 4, 200, 40
 #: Threads share a run.
 _COUNTING = threading.Lock()
