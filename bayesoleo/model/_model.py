@@ -14,7 +14,7 @@ import re
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import sympy as sp
 
@@ -28,10 +28,12 @@ type Text = str | float | sp.Expr
 type Terms = Mapping[str, sp.Expr]
 
 
-def _slope(term: sp.Expr, moving: sp.Symbol) -> float:
+@lru_cache(maxsize=5_000)
+def _slope(term: sp.Expr, moving: sp.Symbol, numbers: frozenset[tuple[sp.Symbol, float]]) -> float:
     """Change of a term with a motion, at a state that is off every zero; zero if it has none, or is
-    not real there."""
-    others = {item: 0.5 for item in term.free_symbols if item != moving}
+    not real there. Models of a search share most of their terms."""
+    known = dict(numbers)
+    others = {item: known.get(item, 0.5) for item in term.free_symbols if item != moving}
     try:
         low, high = (complex(term.subs(others).subs(moving, value)) for value in (0.25, 0.75))
     except (TypeError, ValueError):  # the larger of numbers of which one is not real
@@ -337,10 +339,13 @@ class Model:
     def _sense(self, output: str, name: str) -> int:
         """Sign with which an output shows what resists a motion: -1 if it is the force on the other
         body. What damps decides, without it what springs back; +1 where terms disagree."""
-        numbers = self.nominal()
-        terms = [self.expand(term).subs(numbers) for term in self.output_terms(output).values()]
+        terms, numbers = map(self.expand, self.output_terms(output).values()), self.nominal()
+        known = [
+            (term, frozenset((item, numbers[item]) for item in term.free_symbols & numbers.keys()))
+            for term in terms
+        ]
         for moving in (derivative_symbol(name, 1), symbol(name)):
-            values = [_slope(term, moving) for term in terms if term.has(moving)]
+            values = [_slope(term, moving, given) for term, given in known if term.has(moving)]
             found = {math.copysign(1.0, value) for value in values if value}
             if found:
                 return -1 if found == {-1.0} else 1

@@ -19,7 +19,7 @@ where the motion sticks; an integrator finds this as it proceeds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import cast
@@ -189,9 +189,15 @@ class InitialState:
         ]
         self.declared = expressions
         self.channels = frozenset(channels)
-        self._values = _Table([_measured(e, record, channels) for e in expressions], kernels)
-        guesses = [_measured(_guess(model, dof), record, channels) for dof in derived.dofs]
-        self._guesses = _Table(guesses, kernels)
+        guesses = [_guess(model, dof) for dof in derived.dofs]
+        self._values, self._guesses = (
+            _table(
+                tuple(_measured(one, record, channels) for one in some),
+                tuple(derived.constants),
+                tuple(derived.active),
+            )
+            for some in (expressions, guesses)
+        )
 
     def __call__(self, p: Array) -> StartStates:
         """States and derivatives for constants ``p (L, np)``; each lane by itself."""
@@ -409,17 +415,26 @@ def _is_inside(admissible: int, conditions: int, p: Array, work: Workspace) -> b
     return True
 
 
+@lru_cache(maxsize=1_000)
+def _table(
+    expressions: tuple[sp.Expr, ...], constants: tuple[str, ...], active: tuple[str, ...]
+) -> _Table:
+    """Candidates of a search start alike: what is compiled for one serves the others."""
+    return _Table(expressions, constants, active)
+
+
 class _Table:
     """Expressions over a model's constants and the equilibrium, with their derivatives."""
 
-    def __init__(self, expressions: list[sp.Expr], kernels: Kernels):
-        derived = kernels.derived
-        names, rest = [symbol(name) for name in derived.constants], symbol(EQUILIBRIUM)
-        self.count, self.active = len(expressions), len(derived.active)
+    def __init__(
+        self, expressions: tuple[sp.Expr, ...], constants: Sequence[str], active: Sequence[str]
+    ):
+        names, rest = [symbol(name) for name in constants], symbol(EQUILIBRIUM)
+        self.count, self.active = len(expressions), len(active)
         flat: list[sp.Expr] = []
         for expression in expressions:
             flat += [expression, sp.diff(expression, rest)]
-            flat += [sp.diff(expression, symbol(name)) for name in derived.active]
+            flat += [sp.diff(expression, symbol(name)) for name in active]
         used = set().union(*(e.free_symbols for e in flat)) if flat else set()
         self.alike = rest not in used
         self.used = [k for k, item in enumerate(names) if item in used]
