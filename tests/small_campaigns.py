@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,15 +139,18 @@ def oscillator_campaign(
     runs: Sequence[tuple[str, float, float, str]] = OSCILLATOR_RUNS,
     periods: int = 6,
     per_period: int = 100,
+    each: Mapping[str, tuple[Callable[[Array, Array], Array], float]] = MappingProxyType({}),
 ) -> ReducedCampaign:
-    """A mass under ``F sin`` against a restoring force ``(x, v)``, after its transient."""
+    """A mass under ``F sin`` against a restoring force ``(x, v)``, after its transient; some runs
+    have a force of their own and an offset of the sensor."""
     rng = np.random.default_rng(seed)
     made = []
     for label, frequency, amplitude, role in runs:
         period, omega = 1 / frequency, 2 * np.pi * frequency
+        law, offset = each.get(label, (restoring, 0.0))
 
-        def rates(t, s, amplitude=amplitude, omega=omega):
-            pull = amplitude * np.sin(omega * t) - restoring(s[0], s[1])
+        def rates(t, s, amplitude=amplitude, omega=omega, law=law):
+            pull = amplitude * np.sin(omega * t) - law(s[0], s[1])
             return [s[1], pull / MASS]
 
         settle = 60 * period
@@ -155,7 +159,7 @@ def oscillator_campaign(
             rates, (0, settle + periods * period), [0.0, 0.0], "DOP853", settle + time, rtol=1e-9,
             atol=1e-12,
         )  # fmt: skip
-        y = found.y[0] + noise * rng.standard_normal(time.size)
+        y = found.y[0] + offset + noise * rng.standard_normal(time.size)
         samples = {"force": amplitude * np.sin(omega * time), "displacement": y}
         made.append(SimulatedRun(label, time, samples, frequency, role=role))
     write_campaign(

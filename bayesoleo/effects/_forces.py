@@ -24,10 +24,10 @@ from bayesoleo.effects._effect import (
     free_name,
 )
 from bayesoleo.effects._parts import (
+    HIGHEST_LINE,
     Amplitude,
     Constant,
     Scales,
-    Scan,
     ShapeParameter,
     coordinate_of,
     velocity_grid,
@@ -516,14 +516,6 @@ def _add_line(model: Model, target: str, names: Names) -> Model:
     return model.with_term(place.kind, place.target, "humming_force", place.sign * force)
 
 
-def _line(model: Model, target: str, scales: Scales) -> tuple[float, ...]:
-    """The dominant frequency; without one, that of the shortest period, for models extended by
-    hand."""
-    return (scales.dominant_frequency or 1.0 / scales.shortest_period,)
-
-
-_LINE = Scan(_line, "that of the highest line")
-
 HUMMING = Effect(
     id="humming_force",
     family="force",
@@ -535,7 +527,7 @@ HUMMING = Effect(
     ),
     places=_driven_balances,
     change=_add_line,
-    shapes=(ShapeParameter("frequency", "Hz", "f_h", "frequency of a hum", _LINE),),
+    shapes=(ShapeParameter("frequency", "Hz", "f_h", "frequency of a hum", HIGHEST_LINE),),
     source="Fisher (1929), Proc. R. Soc. A 125, 54-59, for the line that it starts from",
     applies_to="balances of forces of driven models, in transient runs with a line that no input"
     " has",

@@ -132,6 +132,15 @@ class Scan:
         return self.of(model, target, scales)
 
 
+def _line(model: Model, target: str, scales: Scales) -> tuple[float, ...]:
+    """The dominant frequency; without one, that of the shortest period, for models extended by
+    hand."""
+    return (scales.dominant_frequency or 1.0 / scales.shortest_period,)
+
+
+HIGHEST_LINE = Scan(_line, "that of the highest line")
+
+
 def geometric(low: float, high: float, ratio: float = 2.0) -> tuple[float, ...]:
     """Values from ``low`` to ``high`` whose neighbours are at most ``ratio`` apart."""
     if not 0 < low < high:

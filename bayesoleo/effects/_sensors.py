@@ -18,6 +18,7 @@ import sympy as sp
 from bayesoleo.effects._effect import BY_RUN, Effect, Names, either_side, free_name
 from bayesoleo.effects._nonparametric import COEFFICIENT
 from bayesoleo.effects._parts import (
+    HIGHEST_LINE,
     Amplitude,
     Constant,
     Scales,
@@ -106,10 +107,10 @@ def _correct_input(
 
 
 def _offset(model: Model, channel: str, names: Names) -> Model:
-    offset = names["sensor_offset"]
+    ((name, offset),) = names.items()
     if channel in model.inputs:
         return _correct_input(model, channel, lambda x, rate: x - offset)
-    return model.with_term("output", channel, "sensor_offset", offset)
+    return model.with_term("output", channel, name, offset)
 
 
 def _gain(model: Model, channel: str, names: Names) -> Model:
@@ -271,6 +272,19 @@ OFFSET = _sensor(
     _offset,
     "4.20: instrumental bias",
 )
+# A sensor that is set to zero before each run, or drifts between runs.
+OFFSET_BY_RUN = replace(
+    OFFSET,
+    id="sensor_offset_by_run",
+    title="Offset of a sensor, different in every run",
+    formula="m = y + b_r",
+    amplitudes=(
+        Amplitude(
+            "sensor_offset_by_run", "channel", "b_r", "offset of the sensor in the run", by_run=True
+        ),
+    ),
+    source=BY_RUN,
+)
 GAIN = _sensor(
     "sensor_gain",
     "Gain error of a sensor",
@@ -340,6 +354,33 @@ DRIFT = _sensor(
 )
 
 
+def _hum(model: Model, channel: str, names: Names) -> Model:
+    turn = 2 * sp.pi * names["frequency"] * TIME
+    shown = names["cosine"] * sp.cos(turn) + names["sine"] * sp.sin(turn)
+    return model.with_term("output", channel, "sensor_hum", shown)
+
+
+# In a force law a force that hums is the same.
+HUM = Effect(
+    id="sensor_hum",
+    family="sensor",
+    title="Hum of a sensor, at a frequency of its own",
+    formula=r"m = y + a_r \cos 2 \pi f_h t + b_r \sin 2 \pi f_h t",
+    amplitudes=tuple(
+        Amplitude(part, "channel", f"{letter}_r", f"{part} part of a hum, by run", by_run=True)
+        for part, letter in (("cosine", "a"), ("sine", "b"))
+    ),
+    places=lambda model: tuple(model.outputs),
+    change=_hum,
+    shapes=(ShapeParameter("frequency", "Hz", "f_h", "frequency of a hum", HIGHEST_LINE),),
+    source="Fisher (1929), Proc. R. Soc. A 125, 54-59, for the line that it starts from",
+    applies_to="outputs, in transient runs with a line that no input has",
+    own_name_per_target=True,
+    kind="transient",
+    shown=lambda scales: scales.dominant_frequency is not None,
+)
+
+
 # -- saturation ------------------------------------------------------------------------------------
 
 
@@ -406,11 +447,13 @@ def _saturation(side: str) -> Effect:
 
 EFFECTS = (
     OFFSET,
+    OFFSET_BY_RUN,
     GAIN,
     ABSOLUTE_GAIN,
     LAG,
     FIRST_ORDER_LAG,
     DRIFT,
+    HUM,
     _saturation("upper"),
     _saturation("lower"),
 )

@@ -174,12 +174,13 @@ def written(folder, runs):
     return reduce_campaign(load_campaign(folder), jobs=1)
 
 
-def shaken(folder, unmeasured):
-    """Three transients, from rest; the model's start is estimated."""
+def shaken(folder, unmeasured, shown=lambda t, k: 0.0 * t):
+    """Three transients, from rest; the model's start is estimated. The sensor shows something more
+    than the motion."""
     runs = []
     for k, (label, role) in enumerate((("a", "fit"), ("b", "fit"), ("c", "hold-out"))):
         time, force, x = pushed(np.random.default_rng(k), lambda t, k=k: unmeasured(t, k))
-        samples = {"force": force, "displacement": x}
+        samples = {"force": force, "displacement": x + shown(time, k)}
         runs.append(SimulatedRun(label, time, samples, role=role, kind="transient"))
     roles = assign(written(folder, runs).records)
     return fit_state(Assembly(system("duffing"), starts=True), roles, NUMERICS), roles
@@ -212,12 +213,35 @@ def test_a_hum_in_transients_is_named_with_frequency_and_size(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_hum_of_the_sensor_is_no_force(tmp_path):
+    """Mains in a channel, below the resonance where both could be meant, and above it."""
+    size = 2e-4
+    for where, own in enumerate((1.1, 7.3)):
+        _, roles = shaken(
+            tmp_path / str(where),
+            lambda t, k: 0.0,
+            lambda t, k, own=own: size * np.cos(2 * np.pi * own * t + 2.0 * k),
+        )
+        assembly = Assembly(system("duffing"), starts=True)
+        few = tuple(map(find_effect, ("humming_force", "sensor_hum", "coulomb_friction")))
+        loop = close_loop(
+            assembly, roles, NUMERICS, effects=few, max_effects=1, nonparametric=False
+        )
+        assert loop.effects == ("sensor_hum",)
+        point = loop.final.fit.point
+        for run in "ab":
+            parts = (f"sensor_hum_{part}_displacement[{run}]" for part in ("cosine", "sine"))
+            found = np.hypot(*(point[name] for name in parts))
+            assert found == pytest.approx(size, rel=0.02)
+
+
+@pytest.mark.slow
 def test_what_does_not_hum_is_not_offered_a_frequency(tmp_path):
     state, _ = shaken(tmp_path, lambda t, _: 0.0)
     scales = scales_of(state.fit, None, ("position",))
     assert scales.dominant_frequency is None
     offered = {option.candidate.effect for option in state.assembly.options(scales)}
-    assert "humming_force" not in offered
+    assert not {"humming_force", "sensor_hum"} & offered
 
 
 def test_a_line_is_found_at_its_frequency_and_noise_has_none():
