@@ -259,7 +259,9 @@ def place_of(
     final, accepted = progress.state, progress.rounds[number].accepted
     assert accepted is not None
     less = final.assembly.without(step)
-    if len(less.steps) != len(final.assembly.steps) - 1:
+    left = set(less.added)
+    gone = [one for one in final.assembly.steps if (one.effect.id, one.target) not in left]
+    if any(one is not step and one.effect.family not in ABSORBING_FAMILIES for one in gone):
         return None  # other effects change the terms of this one
     fitted = replace(roles, held_out=(), strategy="none")
     # What the priors hardly allow was looked at when the effect was added: no draws from them.

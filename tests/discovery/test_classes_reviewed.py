@@ -116,6 +116,33 @@ def test_what_is_nearer_beside_the_others_replaces_a_first_effect_that_was_not(t
     assert loop.final.at_floor
 
 
+def cubic(x, v, _):
+    return 1000 * x + 4e6 * x**3 + 200 * v
+
+
+def test_an_effect_that_varies_by_run_gives_way_with_its_variation(tmp_path):
+    """A quintic spring of each run's own imitates the cubic one that is there."""
+    roles = assign(damper_campaign(tmp_path, cubic, per_period=60.3).records)
+    begun = added_first(roles, "quintic_stiffness")
+    state, base = begun.state, begun.state.base()
+    scores = score_all(base, options(state, ("varies_by_run",)), jobs=1)[0]
+    score = next(one for one in scores if one.option.key[1] == "quintic_stiffness")
+    result = refit(base, score, NUMERICS)
+    after = fit_state(result.assembly, roles, NUMERICS)
+    item = next(one for one in rank(scores, 40.0, {id(score): result}) if one.score is score)
+    entry = Round(state, (item,), {}, item, after, "", 40.0)
+    loop = close_loop(
+        Assembly(damper(cubic=False)),
+        roles,
+        NUMERICS,
+        effects=(*EFFECTS, find_effect("varies_by_run")),
+        known=Progress(begun.first, after, (*begun.rounds, entry)),
+        max_effects=2,
+    )
+    assert loop.effects == ("cubic_stiffness",)
+    assert loop.final.at_floor
+
+
 def test_another_first_effect_is_followed_only_where_it_leads_as_far(tmp_path):
     """Friction and a cubic spring are there: damping of another law beside either leaves more."""
     roles = assign(damper_campaign(tmp_path, cubic_and_friction, per_period=60.3).records)

@@ -14,6 +14,8 @@ ALONE = {
     "gas_solubility", "heat_exchange", "input_dependent_term",
     "first_order_lag",  # in tests/benchmarks/structure_cases.py
     "overflow", "overflow_below",  # in test_overflow.py
+    "sensor_hum",  # in test_forces_in_time.py
+    "sensor_offset_by_run",  # in test_offsets_by_run.py
 }  # fmt: skip
 
 

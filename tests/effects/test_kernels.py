@@ -25,7 +25,9 @@ def rows(names_and_orders) -> np.ndarray:
 @pytest.mark.parametrize("name", ["f16n1d2", "viscous_damper"])
 def test_kernels_are_finite_at_the_null(name, offered):
     for candidate in offered(system(name)):
-        model = driven_by(candidate.model, "displacement")
+        model = candidate.model
+        if (candidate.effect, candidate.target) != ("sensor_hum", "displacement"):
+            model = driven_by(model, "displacement")
         compiled = kernels(model, backend="numpy")
         derived = compiled.derived
         orders = zip(derived.dofs, derived.orders, strict=True)
