@@ -252,9 +252,10 @@ class _Along:
         for _ in range(STEPS):
             allowed = not section.is_spent and np.isfinite(theta).all()
             one = self._evaluated(theta) if allowed else None
-            if one is None:
+            about = None if one is None else self.frame.about(one.here, self.patterns)
+            if one is None or about is None or not about.is_finite:
                 return None
-            there, self.about[place] = one, self.frame.about(one.here, self.patterns)
+            there, self.about[place] = one, about
             theta, away = self._moved(self.about[place], there, place)
             if away < NEAR:
                 return there

@@ -462,6 +462,11 @@ class GivenStructure:
         _, mean, covariance, noise = self._posterior(cell[0], precision, every)
         return mean, noise * covariance
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether products of columns are numbers; those of a motion that runs away overflow."""
+        return bool(np.isfinite(self.products).all())
+
     def without(self, k: int) -> GivenStructure:
         """The same where one parameter is held."""
         rows = np.delete(np.arange(self.products.shape[1]), 1 + k)
