@@ -365,8 +365,9 @@ def close_loop(
     loop = loop_of(known, roles)
     try:
         structures = probabilities(known, numerics, prior, callback)
-    except (np.linalg.LinAlgError, ArithmeticError) as error:
-        # What was found stands without them.
+    except (np.linalg.LinAlgError, ArithmeticError, ValueError) as error:
+        # What was found stands without them. SciPy says with a ValueError that a matrix is not
+        # finite.
         return replace(loop, notes=(*loop.notes, f"{NO_PROBABILITIES}: {error}"))
     return replace(loop, structures=structures)
 

@@ -196,12 +196,20 @@ def test_a_search_without_probabilities_has_none_in_its_summary():
     assert structures_entry(loop(), {}) is None
 
 
-def test_what_was_found_stands_where_probabilities_fail(monkeypatch):
+@pytest.mark.parametrize(
+    "error",
+    [
+        np.linalg.LinAlgError("Matrix is not positive definite"),
+        ValueError("array must not contain infs or NaNs"),
+        FloatingPointError("overflow"),
+    ],
+)
+def test_what_was_found_stands_where_probabilities_fail(error, monkeypatch):
     found = loop()
     progress = SimpleNamespace(first=None, state=None)
 
     def fails(*_):
-        raise np.linalg.LinAlgError("Matrix is not positive definite")
+        raise error
 
     for name, value in {
         "searched": lambda known, _: known, "best_of_beam": lambda known, *_: known,
@@ -212,7 +220,7 @@ def test_what_was_found_stands_where_probabilities_fail(monkeypatch):
     assert ended.structures is None
     assert ended.rounds == found.rounds
     (note,) = ended.notes
-    assert note == f"{_loop.NO_PROBABILITIES}: Matrix is not positive definite"
+    assert note == f"{_loop.NO_PROBABILITIES}: {error}"
 
 
 def test_rounding_leaves_no_probability_above_one():
