@@ -46,10 +46,21 @@ class RecordNoise:
         Of a sample, SI.
     input_noise : float
         Part of the averaged residual's noise that comes from the inputs, SI.
+    left : float
+        Root mean square of what the model left through which the inputs' noise was carried, SI.
     """
 
     sigma: float
     input_noise: float
+    left: float
+
+    def limits(self, left: float) -> bool:
+        """Whether a model that leaves so much has no more noise of its inputs than this.
+
+        That noise comes through the model: a stiff one lets little through. What a model that
+        explains less lets through says nothing of one that explains more.
+        """
+        return self.left <= left
 
 
 @dataclass(frozen=True)
@@ -65,7 +76,8 @@ class Roles:
     description : str
         The same as a sentence.
     measured : mapping of (run, output) to RecordNoise
-        Noise is a property of the records: once it was measured no later model has more of it.
+        Noise is a property of the records: once it was measured no later model has more of it. That
+        of inputs comes through the model, and holds for those that leave no less.
     """
 
     fitted: tuple[Record, ...]

@@ -171,7 +171,8 @@ class ErrorTable:
     def record_noise(self) -> dict[tuple[str, str], RecordNoise]:
         """The noise of each output in each run, for later models of the same records."""
         return {
-            (e.run, e.output): RecordNoise(e.average.sigma, e.input_noise) for e in self.entries
+            (e.run, e.output): RecordNoise(e.average.sigma, e.input_noise, e.rms)
+            for e in self.entries
         }
 
     @property
@@ -301,13 +302,15 @@ def compared(
     )
     drawn = not (record.periodic and errors_known(run))
     scale = borne_out(columns, shown, drawn=drawn, policy=policy)
-    factors = [_factor(scale, size, known) for size, known in zip(spread, before, strict=True)]
+    rms = [float(np.sqrt(np.mean(rest[weights(record) > 0] ** 2))) for rest in left]
+    each = zip(spread, before, rms, strict=True)
+    factors = [_factor(scale, size, known, size_left) for size, known, size_left in each]
     entries = [
         RunError(
             record.label,
             roles[record.label],
             output,
-            float(np.sqrt(np.mean(left[b][weights(record) > 0] ** 2))),
+            rms[b],
             averages[b],
             float(factors[b] * spread[b]),
             spectra[b],
@@ -334,9 +337,10 @@ def _feigned(
     return float(chance * scatter + by_input**2)
 
 
-def _factor(scale: float, spread: float, known: RecordNoise | None) -> float:
-    """Factor for the input's noise, limited to the noise that was found with earlier models."""
-    if known is None or spread == 0:
+def _factor(scale: float, spread: float, known: RecordNoise | None, left: float) -> float:
+    """Factor for the input's noise, limited to the noise that was found with earlier models which
+    explain as much."""
+    if known is None or spread == 0 or not known.limits(left):
         return scale
     return min(scale, known.input_noise / spread)
 
@@ -370,21 +374,23 @@ def least_noise(one: Noise, other: Noise) -> dict[tuple[str, str], RecordNoise]:
     """The smaller of two measurements of the noise, by run and output.
 
     A residual is not smaller than the noise in it, whatever the model, so that the smallest
-    measurement is the best. A run without a solution has no measurement.
+    measurement is the best; the inputs' noise is that of the model which leaves least. A run
+    without a solution has no measurement.
     """
     found = {key: noise for key, noise in one.items() if _is_known(noise)}
     for key, noise in other.items():
         if not _is_known(noise):
             continue
         known = found.get(key, noise)
+        limits = [n.input_noise for n in (known, noise) if n.limits(min(known.left, noise.left))]
         found[key] = RecordNoise(
-            min(known.sigma, noise.sigma), min(known.input_noise, noise.input_noise)
+            min(known.sigma, noise.sigma), min(limits), min(known.left, noise.left)
         )
     return found
 
 
 def _is_known(noise: RecordNoise) -> bool:
-    return bool(np.isfinite(noise.sigma) and np.isfinite(noise.input_noise))
+    return bool(np.isfinite([noise.sigma, noise.input_noise, noise.left]).all())
 
 
 def with_same_noise(table: ErrorTable, noise: Noise) -> ErrorTable:
@@ -404,9 +410,10 @@ def _with_noise(entry: RunError, noise: RecordNoise) -> RunError:
     if isinstance(average, LocalAverage) and 0 < noise.sigma < average.sigma:
         factor = noise.sigma / average.sigma
         average = replace(average, sigma=noise.sigma, noise=factor * average.noise)
-    if factor == 1.0 and not noise.input_noise < entry.input_noise:
+    limited = noise.limits(entry.rms) and noise.input_noise < entry.input_noise
+    if factor == 1.0 and not limited:
         return entry
-    from_input = min(entry.input_noise, noise.input_noise)
+    from_input = noise.input_noise if limited else entry.input_noise
     scale = entry.input_scale * from_input / entry.input_noise if from_input else 0.0
     quiet = replace(entry, average=average, input_noise=from_input, input_scale=scale)
     if entry.expected_error is None:

@@ -200,10 +200,10 @@ def test_input_noise_that_the_residual_does_not_show_is_bounded_by_it():
 
 
 def test_no_round_has_another_noise():
-    """What a later model shows less of was never there."""
-    loud = replace(noise_entry(ratio=4.0), input_noise=3.0, expected_error=4.0, run="a")
+    """What a later model shows less of, which leaves no more, was never there."""
+    loud = replace(noise_entry(ratio=4.0), input_noise=3.0, expected_error=4.0, run="a", rms=9.0)
     noise = least_noise(
-        {("a", "force"): RecordNoise(1.0, 3.0)}, {("a", "force"): RecordNoise(1, 1.0)}
+        {("a", "force"): RecordNoise(1.0, 3.0, 9.0)}, {("a", "force"): RecordNoise(1, 1.0, 8.0)}
     )
     (quiet,) = with_same_noise(ErrorTable((loud,)), noise).entries
     own = loud.noise**2 - 9.0
@@ -212,10 +212,25 @@ def test_no_round_has_another_noise():
     assert quiet.ratio_to_expected > loud.ratio_to_expected
 
 
+def test_what_a_worse_model_lets_through_of_its_inputs_limits_no_better_one():
+    """A declared spring that is too stiff hardly moves by the noise of the force; the true one
+    does."""
+    key, stiff, true = ("a", "force"), RecordNoise(1.2, 0.5, 90.0), RecordNoise(1.0, 3.0, 4.0)
+    for one, other in ((stiff, true), (true, stiff)):
+        assert least_noise({key: one}, {key: other}) == {key: RecordNoise(1.0, 3.0, 4.0)}
+    right = replace(noise_entry(), input_noise=3.0, expected_error=4.0, run="a", rms=4.0)
+    assert with_same_noise(ErrorTable((right,)), {key: stiff}).entries == (right,)
+    # A model that explains as much with less has less.
+    other = RecordNoise(1.0, 2.0, 4.0)
+    assert least_noise({key: true}, {key: other}) == {key: other}
+    (limited,) = with_same_noise(ErrorTable((right,)), {key: other}).entries
+    assert limited.input_noise == 2.0
+
+
 def test_the_noise_of_a_run_that_could_not_be_solved_is_not_known():
     """A later model that solves the run measures it."""
-    unsolved = {("a", "force"): RecordNoise(np.nan, np.nan)}
-    later = {("a", "force"): RecordNoise(1.0, 0.5)}
+    unsolved = {("a", "force"): RecordNoise(np.nan, np.nan, np.nan)}
+    later = {("a", "force"): RecordNoise(1.0, 0.5, 2.0)}
     assert least_noise({}, unsolved) == {}
     assert least_noise(unsolved, later) == later
     assert least_noise(later, unsolved) == later
