@@ -203,7 +203,11 @@ def lead_of_unexplained(summary: Mapping[str, Any]) -> str:
         return f"{lead}, probably {title_of(name(best), summary)} ({p})"
     if found["nothing"] >= LIKELY:
         p = spoken(found["nothing"])
-        return f"An error is left that is not noise, yet that nothing is missing has {p}"
+        # The probabilities know the colour of what is left.
+        return (
+            "More is left than is expected, which may be coloured noise; nothing is missing with"
+            f" probability {p}"
+        )
     return lead
 
 

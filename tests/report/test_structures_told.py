@@ -120,7 +120,8 @@ def test_nothing_missing_is_not_claimed_against_its_probability():
         ({(COULOMB,): 0.4, (STRIBECK,): 0.4}, "Something is missing: "),
         (
             {NOTHING: 0.8},
-            "An error is left that is not noise, yet that nothing is missing has 0.80",
+            "More is left than is expected, which may be coloured noise; nothing is missing with"
+            " probability 0.80: ",
         ),
     ],
 )
