@@ -102,7 +102,7 @@ def test_a_lone_transient_leaves_nothing_to_hold_out(records):
 def test_noise_that_was_measured_is_found_again(tmp_path):
     """Of the halves of a lone run by each of them, of halves made later by the whole run."""
     (whole,) = damper_campaign(tmp_path, runs=DAMPER_RUNS[:1], periods=8).records
-    roles, own, all_of_it = assign([whole]), RecordNoise(1.0, 0.1), RecordNoise(2.0, 0.2)
+    roles, own, all_of_it = assign([whole]), RecordNoise(1.0, 0.1, 3.0), RecordNoise(2.0, 0.2, 4.0)
     label = roles.fitted[0].label
     assert roles.noise_of("force", label) is None
     assert replace(roles, measured={(label, "force"): own}).noise_of("force", label) == own
