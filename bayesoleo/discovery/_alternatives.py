@@ -333,7 +333,20 @@ def best_of_beam(
         if other is not None and other.state.assembly.added:
             declared = roles.strategy == "declared"
             best = _better(best, other, declared, numerics.policy, callback)
-    return best
+    cut = len(best.state.assembly.steps) >= _most_compared(progress, max_effects)
+    if best is progress or best.state.at_floor or not cut:
+        return best
+    # Its last round only ranked, because the comparison allowed it no more effects than the other
+    # search had.
+    callback("go on with the effects that were taken")
+    return follow(replace(best, rounds=best.rounds[:-1]), max_effects)
+
+
+def _most_compared(progress: Progress, max_effects: int) -> int:
+    """Largest number of effects of a search that is compared with a finished one."""
+    present, opening = len(progress.state.assembly.added), progress.rounds[0]
+    few = progress.state.at_floor and not (opening.accepted and opening.accepted.absorbs)
+    return max(present, 2) if few else min(max(present + 1, 2), max_effects)
 
 
 def followed(progress: Progress, policy: SearchPolicy) -> list[Ranked]:
@@ -392,15 +405,14 @@ def _followed(
             return None
         after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
         reason += "; it is added provisionally, to be confirmed together with the next one"
-    present = len(progress.state.assembly.added)
-    few = progress.state.at_floor and not (opening.accepted and opening.accepted.absorbs)
-    most = max(present, 2) if few else min(max(present + 1, 2), max_effects)
     begun = Round(
         opening.before, opening.ranking, opening.failed, first, after, reason, opening.tests
     )
     # Only the note on the roles applies to the other search too.
     notes = tuple(note for note in progress.notes if note == roles.description)
-    found = follow(Progress(progress.first, after, (begun,), notes), most)
+    found = follow(
+        Progress(progress.first, after, (begun,), notes), _most_compared(progress, max_effects)
+    )
     if provisional and not _together_confirmed(found):
         return None
     return found

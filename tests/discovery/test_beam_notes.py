@@ -100,3 +100,34 @@ def test_of_two_models_that_fit_alike_hold_out_runs_take_one(
     found = beam._better(one, other, declared, SearchPolicy(), print)
     known = {id(one): "one", id(other): "other"}
     assert known.get(id(found), found) == (taken if declared else "both")
+
+
+@pytest.mark.parametrize(
+    ("added", "floor", "goes_on"), [(2, False, True), (1, False, False), (2, True, False)]
+)
+def test_a_search_that_was_stopped_for_a_comparison_goes_on(monkeypatch, added, floor, goes_on):
+    """Only its first rounds are compared with equally many effects; what it may add is the user's
+    limit."""
+    opening = SimpleNamespace(accepted=None)
+    taken = tuple(f"cause {k}" for k in range(added))
+    state = SimpleNamespace(
+        assembly=SimpleNamespace(added=[(one, "stroke") for one in taken], steps=taken),
+        at_floor=floor,
+    )
+    first = SimpleNamespace(effect=taken[0], target="stroke")
+    stopped = Progress(None, state, (opening, "added", "ranked only"), ())
+    asked = []
+
+    def follow(progress, most):
+        asked.append((progress.rounds, most))
+        return "carried on"
+
+    monkeypatch.setattr(beam, "followed", lambda *_: [first])
+    monkeypatch.setattr(beam, "leads_as_far", lambda *_: True)
+    monkeypatch.setattr(beam, "_followed", lambda *_: stopped)
+    monkeypatch.setattr(beam, "_better", lambda best, other, *_: other)
+    progress = Progress(None, ended("play").state, (opening,), ())
+    numerics, roles = SimpleNamespace(policy=None), SimpleNamespace(strategy="declared")
+    found = beam.best_of_beam(progress, roles, numerics, follow, None, 6, lambda _: None)
+    assert (found == "carried on") is goes_on
+    assert asked == ([((opening, "added"), 6)] if goes_on else [])
