@@ -53,9 +53,8 @@ class _About:
         """Posterior about what was evaluated there."""
         scale = self.scale
         # Unknowns in units of their priors' deviations, lest the system depend on units.
-        pull = scale.slope(theta) * scale.sd / scale.unit(theta)
+        pull, precision = scale.quadratic(theta)
         sensitivity = self._by_run([(j * scale.sd).T for j in found.sensitivity])
-        precision = scale.root.T @ scale.root
         return self.errors.linearised(sensitivity, self._by_run(found.residual), precision, pull)
 
     def height(self, theta: Array, residual: Sequence[Array]) -> float:

@@ -514,9 +514,7 @@ def _prior_terms(fit: ModelFit) -> tuple[Array, Array]:
     """
     scale = PriorScale.of(fit.problem.priors, fit.problem.names)
     theta, measured = fit.point.theta, measured_of(fit.problem)
-    slope = scale.slope(theta) * scale.sd / scale.unit(theta)
-    # Next to nothing is known of the curvature within bounds; the width says as much.
-    precision = scale.root.T @ scale.root
+    slope, precision = scale.quadratic(theta)
     return np.where(np.outer(measured, measured), precision, 0.0), np.where(measured, slope, 0.0)
 
 

@@ -78,6 +78,8 @@ EFFECTS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 REMAINDERS = (0.03, 0.1, 0.3, 1.0, 3.0)
 #: Effects that act alone of which each has a group of its own, and its least probability.
 GROUPS, LEAST_GROUP = 7, 0.01
+#: Part of a sum of products below which a difference of such sums is rounding.
+_LOST = 1e-12
 _LOG_2_PI = float(np.log(2 * np.pi))
 _LOG_HALF = float(np.log(0.5))
 
@@ -493,14 +495,20 @@ class CatalogueErrors(ErrorModel):
     def _components(
         self, parts: tuple[Array, float, Shared], count: int, precision: Array, pull: Array
     ) -> Components:
-        """The components at one size of the remainder and of effects, over the noise."""
+        """The components at one size of the remainder and of effects, over the noise.
+
+        The noise's variance scales the sum of squares alone: priors do not depend on it.
+        """
         gram, logs, shared = parts
         covariance = np.linalg.inv(gram[:-1, :-1] + precision)
         right = gram[:-1, -1] + pull
         mean = covariance @ right
-        left = max(float(gram[-1, -1] - right @ mean), 1e-300)
+        prior = float(pull @ mean - 0.5 * mean @ precision @ mean)
+        least = _LOST * max(float(gram[-1, -1]), _LOST)
+        square = float(gram[-1, -1] - right @ mean)
+        left = max(square + 2 * prior, least)
         logs = logs - float(np.linalg.slogdet(covariance)[1])
-        start = -0.5 * (count * np.log(left) + logs) + np.log(0.5 if len(self._alone) else 1.0)
+        start = prior - 0.5 * (count * np.log(left) + logs)
         if not len(self._alone):
             nothing = np.empty((0, ALONE))
             return Components(
@@ -509,16 +517,25 @@ class CatalogueErrors(ErrorModel):
             )  # fmt: skip
         own, cross = shared.along(self._alone)
         turned = covariance @ cross[:-1]
-        information = np.maximum(own - np.sum(cross[:-1] * turned, axis=0), 0.0)[:, None]
-        score = (cross[-1] - cross[:-1].T @ mean)[:, None]
+        information = own - np.sum(cross[:-1] * turned, axis=0)
+        # Of an effect that the unknowns imitate, rounding is left, and no information.
+        told = information > _LOST * own
+        information = np.where(told, information, 0.0)[:, None]
+        score = np.where(told, cross[-1] - cross[:-1].T @ mean, 0.0)[:, None]
         gain = self._alone_squares / (1 + self._alone_squares * information)
-        rest = np.maximum(left - gain * score**2, 1e-300)
-        heights = self._log_odds[:, None] - 0.5 * (
-            count * np.log(rest) + logs + np.log1p(self._alone_squares * information)
+        moved = gain * score
+        pulled = ((pull - precision @ mean) @ turned)[:, None]
+        curved = np.sum(turned * (precision @ turned), axis=0)[:, None]
+        priors = prior - moved * pulled - 0.5 * moved**2 * curved
+        rest = np.maximum(square - gain * score**2 + 2 * priors, least)
+        heights = (
+            self._log_odds[:, None]
+            + priors
+            - 0.5 * (count * np.log(rest) + logs + np.log1p(self._alone_squares * information))
         )
         return Components(
-            np.append(start, heights.ravel()), mean, covariance, left / count, turned,
-            gain * score, gain, rest / count,
+            np.append(start + _LOG_HALF, heights.ravel()), mean, covariance, left / count, turned,
+            moved, gain, rest / count,
         )  # fmt: skip
 
     # -- start, and draws --------------------------------------------------------------------

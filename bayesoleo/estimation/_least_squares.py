@@ -31,7 +31,7 @@ from bayesoleo.error_models._fitting import RANK, inverse_gram, least_squares
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._problem import EstimationProblem
 from bayesoleo.model._correlated_priors import Correlated, log_density_of, scaled_root
-from bayesoleo.model._priors import LogNormal, Normal, Prior
+from bayesoleo.model._priors import LogNormal, LogUniform, Normal, Prior
 
 # A centred difference over this fraction of the prior's sd is exact for a quadratic log density and
 # good to about 1e-8 for the others.
@@ -189,6 +189,26 @@ class PriorScale:
             if not isinstance(prior, Normal | Correlated):
                 slope[..., index] = self._slope(index, theta[..., index])
         return slope
+
+    def quadratic(
+        self, theta: Float[Array, " unknowns"]
+    ) -> tuple[Float[Array, " unknowns"], Float[Array, "unknowns unknowns"]]:
+        """Slope (l,) and precision (l, l) of the log prior about one vector, for steps of the
+        unknowns themselves in units of their priors' standard deviations.
+
+        A prior of a logarithm is the closer, the smaller the value. One that is flat in the
+        logarithm is as the normal one with its moments: its own slope is no part of a parabola.
+        Next to nothing is known of the curvature within bounds; the width says as much.
+        """
+        slope, unit = self.slope(theta), self.unit(theta)
+        for index, prior in enumerate(self.priors):
+            if isinstance(prior, LogUniform) and theta[index] > 0:
+                low, high = np.log([prior.low, prior.high])
+                spread = float(high - low) / np.sqrt(12.0)
+                slope[index] = (0.5 * float(low + high) - np.log(theta[index])) / spread
+                unit[index] = theta[index] * spread
+        turn = self.sd / unit
+        return slope * turn, turn[:, None] * (self.root.T @ self.root) * turn
 
     def _slope(self, index: int, value: Array) -> Array:
         prior, sd = self.priors[index], self.sd[index]

@@ -25,8 +25,8 @@ class Stand:
 
     def linearised(self, theta, found):
         rows = found.sensitivity[0] * self.scale.sd
-        pull = self.scale.slope(theta) * self.scale.sd / self.scale.unit(theta)
-        covariance = np.linalg.inv(rows.T @ rows + self.scale.root.T @ self.scale.root)
+        pull, precision = self.scale.quadratic(theta)
+        covariance = np.linalg.inv(rows.T @ rows + precision)
         return Linearised(0.0, covariance @ (rows.T @ found.residual[0] + pull), covariance)
 
     def height(self, theta, residual):

@@ -16,7 +16,8 @@ from bayesoleo.estimation import (
     mode_covariance,
     polish,
 )
-from bayesoleo.model._priors import LogNormal, Normal
+from bayesoleo.estimation._least_squares import PriorScale
+from bayesoleo.model._priors import LogNormal, LogUniform, Normal
 from bayesoleo.solvers._orbit import Status
 
 VELOCITY = np.sin(np.linspace(0.0, 2 * np.pi, 200, endpoint=False))
@@ -137,3 +138,32 @@ def test_a_slope_without_optimum_ends_where_the_likelihood_is_level(method):
 def test_a_start_without_logarithm_is_refused(start):
     with pytest.raises(InputError, match="key slope: start lies outside the prior's support"):
         estimate(friction_problem(20.0, start=start))
+
+
+@pytest.mark.parametrize("value", [0.02, 0.3, 1.0, 4.0])
+def test_a_prior_of_a_logarithm_is_a_parabola_about_any_value(value):
+    """So steps that data ask for cost what the density says, however small the value is."""
+    prior = LogNormal(1.0, 0.8)
+    scale = PriorScale.of((prior, Normal(2.0, 3.0)), ("small", "other"))
+    slope, precision = scale.quadratic(np.array([value, 5.0]))
+    assert precision[0, 1] == 0.0
+    for part in (-0.05, 0.05):
+        step = np.array([part * value / scale.sd[0], 0.3])
+        change = slope @ step - 0.5 * step @ precision @ step
+        exact = prior.log_density(value * (1 + part)) - prior.log_density(value)
+        exact += Normal(2.0, 3.0).log_density(5.9) - Normal(2.0, 3.0).log_density(5.0)
+        # The third derivative over so small a step.
+        assert change == pytest.approx(exact, abs=0.02)
+    # A fall to nothing is no gain.
+    step = np.array([-value / scale.sd[0], 0.0])
+    assert slope @ step - 0.5 * step @ precision @ step < abs(np.log(value)) / 0.8**2 + 1.0
+
+
+def test_what_is_flat_in_its_logarithm_does_not_pull_a_small_value_to_nothing():
+    prior = LogUniform(1e-4, 1.0)
+    scale = PriorScale.of((prior,), ("rate",))
+    slope, precision = scale.quadratic(np.array([3e-4]))
+    best = float(slope[0] / precision[0, 0]) * scale.sd[0] + 3e-4
+    # The most that the parabola could gain is the square of a distance of 1.7 deviations at most.
+    assert 0.5 * slope[0] ** 2 / precision[0, 0] < 0.5 * 3.0
+    assert 3e-4 < best < 3e-3

@@ -280,9 +280,10 @@ def test_evidence_of_more_than_noise_is_that_of_dense_covariances():
             matrix = dense(campaign, model, model.coordinates(np.array([[0.0, 0.0, size]]))[0])
         weighted = np.linalg.solve(matrix, np.vstack([rows, e]).T)
         information, right = rows @ weighted[:, :-1] + precision, rows @ weighted[:, -1] + pull
-        left = e @ weighted[:, -1] - right @ np.linalg.solve(information, right)
+        x = np.linalg.solve(information, right)
+        left = (e - x @ rows) @ np.linalg.solve(matrix, e - x @ rows)
         logs = np.linalg.slogdet(matrix)[1] + np.linalg.slogdet(information)[1]
-        heights.append(-0.5 * (e.size * np.log(left) + logs))
+        heights.append(pull @ x - x @ precision @ x / 2 - 0.5 * (e.size * np.log(left) + logs))
     odds = logsumexp(heights[1:]) - np.log(len(heights)) - heights[0]
     assert found.log_odds == pytest.approx(odds, rel=1e-9)
     centre = np.linalg.solve(rows @ rows.T + precision, rows @ e + pull)
