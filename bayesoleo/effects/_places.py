@@ -526,7 +526,8 @@ LOOKED_FOR = frozenset(
 
 def storing_places(model: Model) -> dict[str, Coordinate]:
     """Those of :func:`force_places` where something is stored, such as the water of a tank: first
-    order, and what stands before the rate is no damping (a force over a velocity).
+    order, and what stands before the rate is no damping (a force over a velocity). A temperature
+    stores heat, and has no level above which that runs over.
 
     Where units are not declared nobody knows, and the place counts.
     """
@@ -538,7 +539,8 @@ def storing_places(model: Model) -> dict[str, Coordinate]:
         for base, power in dimensions(model.dofs[place.name].unit).items():
             powers[base] = powers.get(base, 0) - power
         damping = powers.get("[mass]", 0) == 1 and powers.get("[time]", 0) == -2
-        if not damping:
+        warm = dimensions(model.dofs[place.name].unit) == dimensions("K")
+        if not (damping or warm):
             found[name] = place
     return found
 

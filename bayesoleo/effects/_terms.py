@@ -213,9 +213,19 @@ def _pressures(model: Model, term: ModelTerm) -> tuple[str, ...]:
 def _temperatures(model: Model, term: ModelTerm) -> tuple[str, ...]:
     """Absolute temperatures: an excess, whose guess is zero, has no ratio."""
     found = _of_unit(model, term, "K")
-    excess = {name for name, dof in model.dofs.items() if sp.sympify(dof.guess) == 0}
+    excess = {name for name, dof in model.dofs.items() if sp.sympify(dof.guess).is_zero}
     stated = (n for n, item in model.conditions.items() if _is_of(item.unit, "K"))
-    return (*(name for name in found if name not in excess), *stated)
+    own = (term.place.name,) if _is_heat_flow(model, term) else ()
+    return (*(name for name in (*own, *found) if name not in excess), *stated)
+
+
+def _is_heat_flow(model: Model, term: ModelTerm) -> bool:
+    """Whether a term follows the temperature whose balance it stands in: its coefficient may vary
+    with that too, as of radiation or of a free flow of air."""
+    place = term.place
+    if place.kind != "equation" or place.velocity is not None or place.name not in model.dofs:
+        return False
+    return _is_of(model.dofs[place.name].unit, "K")
 
 
 def _others(model: Model, term: ModelTerm) -> tuple[str, ...]:
@@ -270,6 +280,8 @@ _QUANTITIES = {
 
 def _is_told_otherwise(model: Model, term: ModelTerm, kind: str, quantity: str) -> bool:
     """Whether the term follows a quantity already, or another effect says the same."""
+    if kind == "temperature" and quantity == term.place.name:
+        return False
     bodies = {term.place.dof, term.place.other} if isinstance(term.place, Between) else {quantity}
     if (bodies if kind == "stroke" else {quantity}) <= term.followed:
         return True
@@ -305,6 +317,7 @@ def _reference(model: Model, target: str, scales: Scales) -> float:
     nominal = {item.name: value for item, value in model.nominal().items()}
     stated = {**nominal, **scales.conditions}
     guess = sp.sympify(model.dofs[name].guess) if name in model.dofs else sp.Integer(0)
+    guess = guess.subs({item: stated.get(str(item), item) for item in guess.free_symbols})
     if _AMBIENT in stated:
         return float(stated[_AMBIENT])
     if guess.is_number and guess > 0:

@@ -99,6 +99,46 @@ def test_a_damped_motion_is_no_store(unit, stores):
     assert bool(find_effect("end_stop_upper").places(model)) != stores
 
 
+def warm(guess: float | str) -> Model:
+    """A heated body that loses heat to its surroundings."""
+    return Model(
+        "kiln",
+        inputs={"heater": "W"},
+        dofs={"body": Dof("K", guess=guess)},
+        parameters={
+            "capacity": Parameter(400.0, "J/K", sd=100.0),
+            "loss": Parameter(2.0, "W/K", sd=1.0),
+            "ambient": Parameter(293.0, "K", fixed=True),
+        },
+        equations={
+            "body": {
+                "store": "capacity*dot(body)",
+                "loss": "loss*(body - ambient)" if guess else "loss*body",
+                "heat": "-heater",
+            }
+        },
+        outputs={"temperature": Output("body", "K")},
+    )
+
+
+def test_a_temperature_has_no_level_above_which_it_runs_over():
+    assert not storing_places(warm("ambient"))
+    assert not find_effect("overflow").places(warm("ambient"))
+
+
+@pytest.mark.parametrize(("guess", "varies"), [("ambient", True), (320.0, True), (0.0, False)])
+def test_a_loss_of_heat_may_change_with_the_body_s_own_temperature(guess, varies):
+    """As radiation does, about the surroundings; an excess, which starts at zero, has no ratio."""
+    effect, model = find_effect("temperature_dependent_term"), warm(guess)
+    assert effect.places(model) == (("body.loss.body",) if varies else ())
+    if varies:
+        sizes = Scales({"body": (293.0, 400.0)}, {}, {}, 100.0, 1000.0)
+        extended = effect.extend(model, "body.loss.body", sizes).model
+        start = 293.0 if guess == "ambient" else guess
+        reference = next(p for name, p in extended.parameters.items() if "reference" in name)
+        assert reference.value == start
+
+
 def test_only_a_store_that_feeds_another_overflows_into_it():
     assert find_effect("overflow").places(TANKS) == ("upper", "lower")
     assert find_effect("overflow_below").places(TANKS) == ("upper",)
