@@ -185,6 +185,11 @@ def _sure(summary: Mapping[str, Any]) -> str:
             "A likeness only: an error is smaller than chance allows, so that the noise is not"
             " what it is held to be."
         )
+    if sentences.named_in_part(summary):
+        return (
+            "A likeness only: a part of what was missing is explained by a curve without a name, so"
+            " that something else acts as well, or instead."
+        )
     if sure == schema.PROBABLE and alike:
         return (
             "Probable, as one of a class: these data cannot tell it from the effects named above."

@@ -31,6 +31,7 @@ from bayesoleo.effects._catalogue import (
     titles_for,
     with_titles,
 )
+from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.plots._discovery import chosen, format_p, format_probability, format_share, name
 from bayesoleo.plots._style import Scale, format_value
 
@@ -104,10 +105,22 @@ def _said(summary: Mapping[str, Any]) -> str:
     if sure == schema.NO_CAUSE and summary["verdict"] == schema.EFFECT_ADDED:
         return f"No cause is named: {found} {was} added; {down}.{outside or _class(summary)}"
     lead = "No cause is named" if sure == schema.NO_CAUSE else "A likeness only"
+    if named_in_part(summary):
+        unnamed = "; but a curve without a name had to explain a part"
+        return f"{lead}: {found} {was} added{likely}; {down}{unnamed}.{outside}{apart}"
     left = f"and {_size_left(summary)}{_unexplained(summary)}"
     if summary["verdict"] == schema.EFFECT_ADDED:
         left = f"explaining most of the excess, but {_size_left(summary)}{_unexplained(summary)}"
     return f"{lead}: {found} {was} added{likely}, {left}.{outside}{apart}"
+
+
+def named_in_part(summary: Mapping[str, Any]) -> bool:
+    """Whether effects with a name leave only noise together with a curve that has none."""
+    pooled = [e for outputs in summary["error_after"].values() for e in outputs.values()]
+    single = [e for runs in summary["rounds"][-1]["error"].values() for e in runs.values()]
+    left = any(too_small(e) or too_large(e) or ratio(e) is None for e in (*pooled, *single))
+    curve = any(one.startswith(FAMILY) for one in summary["effects"])
+    return curve and not left and certainty(summary) == schema.LIKENESS
 
 
 def _nothing_added(summary: Mapping[str, Any]) -> str:

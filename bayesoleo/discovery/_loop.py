@@ -101,7 +101,8 @@ def certainty_of(final: State, certain: bool) -> str | None:
         return None
     if all(step.effect.family in NO_CAUSE for step in steps):
         return schema.NO_CAUSE
-    if not _as_expected(final):
+    # What a curve without a name had to explain is more than the named effects do.
+    if not _as_expected(final) or any(step.effect.family == FAMILY for step in steps):
         return schema.LIKENESS
     return schema.CERTAIN if certain and not final.fit.shift > UNRESOLVED else schema.PROBABLE
 

@@ -99,7 +99,7 @@ def test_no_name_is_certain_on_a_mesh_that_moves_the_estimate():
 def test_certainty_of_names():
     assert certainty_of(state(1.0), certain=False) is None
     assert certainty_of(state(1.0, "friction"), certain=True) == schema.CERTAIN
-    assert certainty_of(state(1.0, "friction", "nonparametric"), certain=False) == schema.PROBABLE
+    assert certainty_of(state(1.0, "friction", "nonparametric"), certain=False) == schema.LIKENESS
     assert certainty_of(state(13.6, "friction"), certain=False) == schema.LIKENESS
     assert certainty_of(state(1.0, "nonparametric", "clock"), certain=False) == schema.NO_CAUSE
     quiet = state(0.16, "friction", quiet=("too little",))

@@ -74,6 +74,16 @@ def test_a_curve_that_leaves_an_error_names_no_cause_either():
     )
 
 
+def test_names_beside_a_curve_without_one_are_a_likeness():
+    """That only noise is left then is no merit of the names alone."""
+    both = ["coulomb_friction @ stroke", "nonparametric_stroke @ stroke"]
+    text = told(both, schema.LIKENESS)
+    assert text.startswith("A likeness only: Coulomb friction (stroke) and nonparametric stroke")
+    assert "the error is then down to" in text
+    assert "; but a curve without a name had to explain a part." in text
+    assert "a part" not in told(both, schema.LIKENESS, ratio=6.0)
+
+
 def test_a_class_is_said_with_titles():
     text = told(["coulomb_friction @ stroke"], schema.PROBABLE,
                 alike=["stribeck_friction", "coulomb_friction @ arm"])  # fmt: skip
