@@ -486,7 +486,8 @@ def _folded(basis: HarmonicBasis, values: Array) -> tuple[NDArray[np.int64], Arr
     """Bin of each sample's phase (N,), one as wide as a sampling interval, and the samples by bin,
     not a number where a bin has fewer than others (bins, periods)."""
     bins = int(1.0 / basis.step)
-    place = np.minimum((_phase(basis) % 1.0 * bins).astype(np.int64), bins - 1)
+    # A phase on the edge of two bins belongs to the upper one, however it was rounded.
+    place = ((_phase(basis) * bins + 1e-6) % bins).astype(np.int64) % bins
     order = np.argsort(place, kind="stable")
     first = np.searchsorted(place[order], np.arange(bins))
     turn = np.arange(basis.samples) - first[place[order]]
@@ -504,8 +505,11 @@ def _smooth_phases(basis: HarmonicBasis, values: Array) -> NDArray[np.bool_]:
     # About the median: an average over periods spreads one outlier over all of them.
     found = significant_harmonics(basis, values).evaluate(_phase(basis), 1.0)
     place, table = _folded(basis, values - found)
-    away = np.abs(table - np.nanmedian(table, axis=1, keepdims=True))
-    unusual = np.nanmedian(away, axis=1) > _UNUSUAL * np.nanmedian(away)
+    # Few samples may leave a bin without any.
+    full = np.isfinite(table).any(axis=1)
+    away = np.abs(table[full] - np.nanmedian(table[full], axis=1, keepdims=True))
+    unusual = np.zeros(len(table), dtype=bool)
+    unusual[full] = np.nanmedian(away, axis=1) > _UNUSUAL * np.nanmedian(away)
     beside = np.arange(-_JUMP, _JUMP + 1)
     near = np.add.outer(np.flatnonzero(unusual), beside) % unusual.size
     unusual[near.ravel()] = True

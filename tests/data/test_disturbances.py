@@ -12,7 +12,13 @@ from small_campaigns import damper, damper_campaign, spring_damper_force
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import checked, prepare
 from bayesoleo.data import data_warnings
-from bayesoleo.data._disturbances import _slow_columns, clean, without_disturbances
+from bayesoleo.data._disturbances import (
+    _folded,
+    _slow_columns,
+    _smooth_phases,
+    clean,
+    without_disturbances,
+)
 from bayesoleo.data._fourier import HarmonicBasis
 from bayesoleo.data._noise import noise_spectrum
 from bayesoleo.data._sample_quality import emptied_lines
@@ -183,6 +189,22 @@ def test_jumps_between_samples_are_no_outliers_and_no_tones():
     cleaned, what = clean(BASIS, values, PERIODS, LEVEL)
     assert not what
     assert cleaned is values
+
+
+@pytest.mark.parametrize(("bins", "samples"), [(3, 30), (6, 30), (6, 60), (7, 35)])
+def test_samples_at_the_same_phases_share_their_bins(bins, samples):
+    """Phases on the edges of bins are not scattered over two by rounding."""
+    table = _folded(HarmonicBasis(samples, 1.0 / bins), np.ones(samples))[1]
+    assert table.shape == (bins, samples // bins)
+    assert np.isfinite(table).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_phase_without_a_sample_is_no_trouble():
+    """Of so few samples one bin of four has none."""
+    basis = HarmonicBasis(4, 0.23)
+    assert not np.isfinite(_folded(basis, np.ones(4))[1]).any(axis=1).all()
+    assert _smooth_phases(basis, np.arange(4.0)).shape == (4,)
 
 
 @pytest.mark.statistical
