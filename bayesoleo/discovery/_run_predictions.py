@@ -77,7 +77,8 @@ def borne_out(
         lines = scipy.fft.rfft(block, axis=1)
         power, there = np.sum(np.abs(lines) ** 2, axis=0), np.abs(scipy.fft.rfft(residual)) ** 2
         for band in _bands(power, policy.noise_bands):
-            coefficients = _of_lines(power[band]) if drawn else _coefficients(lines[:, band])
+            count = _of_draws if drawn else _coefficients
+            coefficients = count(lines[:, band])
             level = policy.noise_false_alarm / policy.noise_bands
             low = float(stats.chi2.ppf(level, coefficients)) / coefficients
             ratio = float(there[band].sum() / power[band].sum())
@@ -94,9 +95,21 @@ def _bands(power: Array, count: int) -> list[slice]:
     return [band for band in found if power[band].sum() > 0.01 * total[-1]]
 
 
-def _of_lines(power: Array) -> float:
-    """The same where each line has two of its own."""
-    return max(2.0 * float(power.sum() ** 2 / np.sum(power**2)), 1.0)
+def _of_draws(lines: NDArray[np.complex128]) -> float:
+    """The same of draws of noise: two of each line, but fewer where draws resemble each other, as
+    where a contact amplifies what came before it.
+
+    The square of a product of two draws has the mean ``tr(C^2)``, and their own squares ``tr(C)``.
+    """
+    power = np.sum(np.abs(lines) ** 2, axis=0)
+    apart = 2.0 * float(power.sum() ** 2 / np.sum(power**2))
+    draws = len(lines)
+    if draws > 1:
+        gram = (lines @ lines.conj().T).real
+        own = np.diag(gram)
+        alike = float(np.sum(gram**2) - np.sum(own**2)) / (draws * (draws - 1))
+        apart = min(apart, float(np.mean(own)) ** 2 / max(alike, 1e-300))
+    return max(apart, 1.0)
 
 
 def _coefficients(lines: NDArray[np.complex128]) -> float:

@@ -42,6 +42,11 @@ FIRST_COSINES = 300
 PRIOR_LINES, SPREAD = 8.0, 3
 #: Directions of the errors of the inputs that are kept in a run.
 MOST_INPUTS = 40
+#: Draws of an input's noise of which the first half shows directions, and the other half how much
+#: noise lies along them.
+INPUT_DRAWS = 64
+#: Variance along a direction, over that of the outputs' own noise, from which it is kept as it is.
+WORTH_A_DIRECTION = 2.0
 #: Lines on either side over which the variance by draws of an input's noise is averaged.
 NEIGHBOURS = 4
 #: Lengths, in cycles, of the squared exponentials whose mean is the spectrum of a smooth remainder.
@@ -211,19 +216,24 @@ class SpectralData:
         ]
         return np.concatenate(levels)
 
-    def input_noise(self, inputs: Callable[[int], tuple[Array, bool]]) -> tuple[Array, Array]:
+    def input_noise(
+        self, inputs: Callable[[int], tuple[Array, int]], variance: Array
+    ) -> tuple[Array, Array]:
         """Errors of the outputs by noise of measured inputs.
 
         An input's harmonic has one error, which all outputs and all their harmonics share, and
         which may be large where a force changes with the direction of motion. The largest of their
-        principal directions are therefore kept as they are. Of draws the variances are taken.
+        principal directions are therefore kept as they are. So are those along which draws lie, as
+        where a contact amplifies what came before it; of the rest of draws the variances are taken.
 
         Parameters
         ----------
         inputs : callable
             Change of the outputs ``(outputs, k, N)`` of a run, by its number, by one standard
-            deviation of each of its inputs' coefficients, SI; whether these are all errors, or
-            draws of them.
+            deviation of each of its inputs' coefficients, SI; how many of them, the first ones, are
+            draws of errors and no errors.
+        variance : ndarray, shape (n,)
+            Of the outputs' own noise, SI.
 
         Returns
         -------
@@ -235,13 +245,17 @@ class SpectralData:
         rows, variances = [], []
         sizes = [run.size * len(self.outputs) for run in self.runs]
         for r, run in enumerate(self.runs):
-            found, known = inputs(r)
+            found, drawn = inputs(r)
             moved = np.moveaxis(run.transformed(found), 1, 0).reshape(-1, sizes[r])
-            kept = _principal(moved) if known else moved[:0]
             before, after = sum(sizes[:r]), sum(sizes[r + 1 :])
-            rows.append(np.pad(kept, ((0, 0), (before, after))))
-            rest = np.maximum(np.sum(moved**2, axis=0) - np.sum(kept**2, axis=0), 0.0)
-            variances.append(rest if known else _of_neighbours(rest, run.size, len(moved)))
+            kept, left = _along_draws(moved[:drawn], variance[before : before + sizes[r]])
+            rest = _of_neighbours(np.sum(left**2, axis=0), run.size, len(left))
+            known = moved[drawn:]
+            shared = _principal(known)
+            rest += np.maximum(np.sum(known**2, axis=0) - np.sum(shared**2, axis=0), 0.0)
+            every = np.concatenate([kept, shared])
+            rows.append(np.pad(every, ((0, 0), (before, after))))
+            variances.append(rest)
         return np.concatenate(rows), np.concatenate(variances)
 
     def smooth(self) -> Array:
@@ -256,6 +270,30 @@ def _principal(rows: Array) -> Array:
     values, vectors = np.linalg.eigh(rows @ rows.T)
     order = np.argsort(-values)[:MOST_INPUTS]
     return np.asarray(vectors[:, order].T @ rows)
+
+
+def _along_draws(moved: Array, variance: Array) -> tuple[Array, Array]:
+    """Errors ``(k, n)`` along the directions that draws ``(m, n)`` have in common, and what draws
+    are beside these ``(m // 2, n)``; sums of squares of either are variances.
+
+    Directions are those of the first half, their variances those of the other half: along its own
+    directions a few draws of any noise seem to lie altogether.
+    """
+    if not moved.any():
+        return moved[:0], moved
+    # Alternately: the draws of one channel follow those of another.
+    first, other = (
+        part * np.sqrt(len(moved) / len(part)) / np.sqrt(variance)
+        for part in (moved[::2], moved[1::2])
+    )
+    directions = np.linalg.svd(first, full_matrices=False)[2]
+    along = other @ directions.T
+    values, vectors = np.linalg.eigh(along.T @ along)
+    chosen = np.flatnonzero(values > WORTH_A_DIRECTION)[::-1][:MOST_INPUTS]
+    axes = vectors[:, chosen].T @ directions
+    kept = np.sqrt(values[chosen])[:, None] * axes
+    left = other - (other @ axes.T) @ axes
+    return kept * np.sqrt(variance), left * np.sqrt(variance)
 
 
 def _around(level: Array, more: int) -> Array:

@@ -18,7 +18,12 @@ from bayesoleo.discovery._assembly import Added
 from bayesoleo.discovery._fit_and_hold_out_error import RunError
 from bayesoleo.discovery._score_basis import Base, present_constants
 from bayesoleo.discovery._score_tests import Score
-from bayesoleo.discovery._spectral_data import EstimatedModel, SpectralData, linearised
+from bayesoleo.discovery._spectral_data import (
+    INPUT_DRAWS,
+    EstimatedModel,
+    SpectralData,
+    linearised,
+)
 from bayesoleo.discovery._structure_columns import (
     Covariances,
     Group,
@@ -33,7 +38,7 @@ from bayesoleo.discovery._structure_columns import (
 )
 from bayesoleo.discovery._structure_evidence import Largest, effect_evidence, pair_evidence
 from bayesoleo.discovery._structures import StructurePrior
-from bayesoleo.prediction._run_errors import errors_known, input_columns
+from bayesoleo.prediction._run_errors import drawn_columns, input_columns
 
 #: Effects whose pairs are considered, and directions that a law outside the catalogue is made of.
 IN_PAIRS, DIRECTIONS = 10, 40
@@ -118,16 +123,17 @@ class Comparison:
         fit, data = base.fit, base.data
         assert data is not None
 
-        def inputs(r: int) -> tuple[Array, bool]:
+        def inputs(r: int) -> tuple[Array, int]:
             run, label = fit.predictor.runs[r], fit.records[r].label
             scale = np.array([errors[label, output].input_scale for output in data.outputs])
-            columns = input_columns(run, present_constants(fit, r))
-            return np.asarray(columns * scale[:, None, None]), errors_known(run)
+            columns = input_columns(run, present_constants(fit, r), INPUT_DRAWS)
+            return columns * scale[:, None, None], drawn_columns(run, INPUT_DRAWS)
 
         used = [errors[r.record.label, o] for r in data.runs for o in data.outputs]
         freedom = float(sum(max(entry.free, 1.0) for entry in used))
-        shared, rest = data.input_noise(inputs)
-        variance = data.noise(errors) + rest
+        own = data.noise(errors)
+        shared, rest = data.input_noise(inputs, own)
+        variance = own + rest
         seen = np.sum(shared**2 / variance, axis=1) > NEGLIGIBLE_INPUT
         return cls(data, variance, shared[seen], min(freedom, KNOWN), scores, prior, curves or {})
 

@@ -57,7 +57,7 @@ MOST_KEPT = 3e8
 TOGETHER = 32
 
 
-def input_columns(run: RunPredictor, p: Array) -> Array:
+def input_columns(run: RunPredictor, p: Array, draws: int = DRAWS) -> Array:
     """Change of the outputs by one standard deviation of each input coefficient.
 
     Parameters
@@ -66,6 +66,8 @@ def input_columns(run: RunPredictor, p: Array) -> Array:
         Anchored near ``p``.
     p : ndarray, shape (np,)
         Model constants.
+    draws : int
+        Number of draws where the errors are too many to stand one by one.
 
     Returns
     -------
@@ -91,17 +93,18 @@ def input_columns(run: RunPredictor, p: Array) -> Array:
     with np.errstate(all="ignore"):
         run.kernels.output_jacobian(z, run.sample_inputs, one, lanes, yz, yp)
         run.kernels.output_inputs(z, run.sample_inputs, one, lanes, yu)
-    changes, by_start = _InputChanges(run, run.record.position), _moved_by_start(run, p, x)
+    changes = _InputChanges(run, run.record.position, draws)
+    by_start = _moved_by_start(run, p, x)
     columns = np.empty((ny, changes.count + by_start.shape[1], samples))
     for part in changes.parts:
         columns[:, part] = np.einsum("yuN,ukN->ykN", yu[0], changes.of(part))
-    for part, moved in _moved(run, one, x) if derived.dofs else ():
+    for part, moved in _moved(run, one, x, draws) if derived.dofs else ():
         columns[:, part] += np.einsum("yzN,zkN->ykN", yz[0], moved)
     columns[:, changes.count :] = np.einsum("yzN,zkN->ykN", yz[0], by_start)
     return columns if np.isfinite(columns).all() else np.zeros((ny, 0, samples))
 
 
-def _moved(run: RunPredictor, p: Array, x: Array) -> Iterator[tuple[slice, Array]]:
+def _moved(run: RunPredictor, p: Array, x: Array, draws: int) -> Iterator[tuple[slice, Array]]:
     """Change of the dofs' rows at the samples, shape (nz, k, N), by some coefficients at a time.
 
     The states of a few coefficients stay in the cache; those of hundreds take several times as long
@@ -116,7 +119,7 @@ def _moved(run: RunPredictor, p: Array, x: Array) -> Iterator[tuple[slice, Array
     run.scheme.rows(x, lanes, step, z)
     run.kernels.jacobian(z, boundary.inputs, p, lanes, g, gz)
     run.kernels.inputs(z, boundary.inputs, p, lanes, gu)
-    changes = _InputChanges(run, run.points)
+    changes = _InputChanges(run, run.points, draws)
     for part in changes.parts:
         right = np.einsum("lduN,ukN->ldkN", gu, changes.of(part))
         states = run.scheme.linear(gz, right, None, lanes, step, initial=held)[0]
@@ -179,9 +182,11 @@ class _InputChanges:
     run : RunPredictor
     phase : ndarray, shape (N,)
         Where.
+    draws : int
+        Number of draws of the errors of a transient's input.
     """
 
-    def __init__(self, run: RunPredictor, phase: Array):
+    def __init__(self, run: RunPredictor, phase: Array, draws: int):
         rows, record = run.kernels.derived.inputs, run.record
         self.shape, self.blocks = (len(rows), phase.size), list[tuple[list[int], _Block]]()
         highest = highest_derivatives(rows)
@@ -199,7 +204,7 @@ class _InputChanges:
                 size, rate = record.time.size, record.rate
                 lines = _noise_lines(curve, 1.0 / rate, size)
                 block = (
-                    _Known(_known_changes(curve, rate, size, derivatives, phase.tobytes()))
+                    _Known(_known_changes(curve, rate, size, derivatives, phase.tobytes(), draws))
                     if lines is None
                     else _Lines(*lines, derivatives, phase)
                 )
@@ -339,13 +344,13 @@ class _Draws:
         self.most, self.lock = most, threading.Lock()
         self.kept: OrderedDict[Smoothed, tuple[Smoothed, ...]] = OrderedDict()
 
-    def of(self, curve: Smoothed) -> tuple[Smoothed, ...]:
-        """Draws of one curve."""
+    def of(self, curve: Smoothed, number: int) -> tuple[Smoothed, ...]:
+        """So many draws of one curve; the first few of many are the few."""
         with self.lock:
-            if curve in self.kept:
+            if len(self.kept.get(curve, ())) >= number:
                 self.kept.move_to_end(curve)
-                return self.kept[curve]
-        found = tuple(curve.errors(DRAWS))
+                return self.kept[curve][:number]
+        found = tuple(curve.errors(number))
         with self.lock:
             self.kept[curve] = found
             while len(self.kept) > 1 and self._size() > self.most:
@@ -362,22 +367,32 @@ _errors = _Draws(MOST_KEPT)
 
 @lru_cache(maxsize=4)
 def _known_changes(
-    curve: Smoothed, rate: float, samples: int, orders: tuple[int, ...], position: bytes
+    curve: Smoothed,
+    rate: float,
+    samples: int,
+    orders: tuple[int, ...],
+    position: bytes,
+    draws: int,
 ) -> Array:
     """The same as :func:`_curve_changes`, kept: each model of a run asks for it again, and draws of
     a long record take longer than to solve the model."""
-    found = _curve_changes(curve, rate, samples, orders, np.frombuffer(position))
+    found = _curve_changes(curve, rate, samples, orders, np.frombuffer(position), draws)
     found.flags.writeable = False
     return found
 
 
 def _curve_changes(
-    curve: Smoothed, rate: float, samples: int, orders: Iterable[int], position: Array
+    curve: Smoothed,
+    rate: float,
+    samples: int,
+    orders: Iterable[int],
+    position: Array,
+    number: int = DRAWS,
 ) -> Array:
     """Change of some derivatives of a curve by one standard deviation of each of its errors, of a
     record of so many samples, and of a length with that reciprocal."""
     lines, found = _noise_lines(curve, 1.0 / rate, samples), []
-    draws = () if lines is not None else _errors.of(curve)
+    draws = () if lines is not None else _errors.of(curve, number)
     for order in orders:
         if lines is not None:
             omega, sd = lines
@@ -385,7 +400,7 @@ def _curve_changes(
             found.append((sd * omega**order)[:, None] * np.cos(turn))
         else:
             each = [draw.evaluate(position, rate, order) for draw in draws]
-            found.append(np.reshape(each, (len(draws), position.size)) / np.sqrt(DRAWS))
+            found.append(np.reshape(each, (len(draws), position.size)) / np.sqrt(number))
     return np.stack(found)
 
 
@@ -425,6 +440,12 @@ def errors_known(run: RunPredictor) -> bool:
     return all(
         c.noise == 0.0 or _noise_lines(c, record.span, record.time.size) is not None for c in curves
     )
+
+
+def drawn_columns(run: RunPredictor, draws: int = DRAWS) -> int:
+    """How many columns of :func:`input_columns`, the first ones, are draws of errors of the inputs
+    or stand beside such draws; zero where each column is one error."""
+    return 0 if errors_known(run) else _InputChanges(run, run.record.position, draws).count
 
 
 def motion_error(run: RunPredictor, tolerance: float = TOLERANCE) -> ErrorEstimate:

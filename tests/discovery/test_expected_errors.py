@@ -32,7 +32,7 @@ from bayesoleo.discovery._fit_and_hold_out_error import (
 )
 from bayesoleo.discovery._loop import close_loop
 from bayesoleo.discovery._policy import SearchPolicy
-from bayesoleo.discovery._run_predictions import borne_out
+from bayesoleo.discovery._run_predictions import _of_draws, borne_out
 from bayesoleo.model import Model, Output, Parameter
 
 FEW = (("a", 1.0, 0.003, "fit"), ("b", 1.5, 0.003, "fit"), ("c", 1.0, 0.012, "hold-out"))
@@ -184,6 +184,29 @@ def test_input_noise_that_the_residual_bears_out_counts_in_full():
         for _ in range(200)
     ]
     assert np.sum(np.array(scales) < 1.0) <= 2
+
+
+@pytest.mark.parametrize("rank", [1, 3, 8])
+def test_draws_that_resemble_each_other_scatter_as_few_coefficients(rank):
+    """A contact amplifies what came before it: all noise then moves the output along few curves."""
+    rng = np.random.default_rng(rank)
+    shapes = rng.standard_normal((rank, 400))
+    lines = np.fft.rfft(rng.standard_normal((16, rank)) @ shapes)
+    # Sixteen draws tell a covariance's square to about 15 %; shapes have about the same length.
+    assert _of_draws(lines) == pytest.approx(rank, rel=0.35)
+    white = np.fft.rfft(rng.standard_normal((16, 400)))
+    assert _of_draws(white) > 300.0
+
+
+def test_noise_along_few_curves_is_seldom_cut_down_by_chance():
+    """A residual may happen to have nothing along the one curve that carries the power."""
+    rng, cut = np.random.default_rng(0), 0
+    for _ in range(300):
+        shape = np.cumsum(rng.standard_normal((2, 400)), axis=1)
+        columns = (rng.standard_normal((16, 2)) @ shape)[None] / 4.0
+        residual = rng.standard_normal(2) @ shape + 0.1 * rng.standard_normal(400)
+        cut += borne_out(columns, [residual], drawn=True) < 0.5
+    assert cut <= 3
 
 
 def test_input_noise_that_the_residual_does_not_show_is_bounded_by_it():

@@ -34,6 +34,17 @@ def test_a_part_of_known_changes_is_that_part():
 def test_draws_of_the_curves_asked_for_last_are_kept_as_far_as_there_is_room(most, kept):
     curves = [Smoothed(0.1, np.zeros((20, 3)), 1.0, 1e-3) for _ in range(4)]
     draws = _Draws(most)
-    found = [draws.of(curve) for curve in curves]
+    found = [draws.of(curve, 16) for curve in curves]
     assert len(draws.kept) == kept
-    assert draws.of(curves[-1]) is found[-1]
+    assert draws.of(curves[-1], 16)[3] is found[-1][3]
+
+
+def test_the_first_of_many_draws_are_the_few():
+    """So that what asks for many changes nothing for what asks for few."""
+    curve = Smoothed(0.1, np.zeros((20, 3)), 1.0, 1e-3)
+    few, draws = _Draws(1e12).of(curve, 16), _Draws(1e12)
+    many = draws.of(curve, 40)
+    assert (len(few), len(many)) == (16, 40)
+    for one, other in zip(few, many, strict=False):
+        np.testing.assert_array_equal(one.states, other.states)
+    assert draws.of(curve, 16)[0] is many[0]
