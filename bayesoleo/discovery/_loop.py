@@ -40,6 +40,8 @@ from bayesoleo.effects._nonparametric import FAMILY
 
 #: Families of effects that name no cause.
 NO_CAUSE = ABSORBING_FAMILIES | {FAMILY}
+#: How SciPy says, with a ValueError, that a matrix is not finite.
+NOT_FINITE = "infs or NaNs"
 
 #: Probability that the effect of a certain name has at least, where probabilities were computed.
 SURE = 0.95
@@ -367,8 +369,10 @@ def close_loop(
     try:
         structures = probabilities(known, numerics, prior, callback)
     except (np.linalg.LinAlgError, ArithmeticError, ValueError) as error:
-        # What was found stands without them. SciPy says with a ValueError that a matrix is not
-        # finite.
+        known = isinstance(error, np.linalg.LinAlgError | ArithmeticError)
+        if not known and NOT_FINITE not in str(error):
+            raise
+        # What was found stands without them.
         return replace(loop, notes=(*loop.notes, f"{NO_PROBABILITIES}: {error}"))
     return replace(loop, structures=structures)
 

@@ -15,6 +15,7 @@ from bayesoleo.discovery._round import _hidden, _may_be_significant
 from bayesoleo.discovery._score_tests import Score, corrected_p, without_twins
 from bayesoleo.discovery._structures import Structure, StructurePosterior, StructurePrior
 from bayesoleo.discovery._summary import structures_entry
+from bayesoleo.errors import InputError
 
 TESTS, POLICY = 60.0, SearchPolicy()
 LEVEL, SAME = POLICY.significance, POLICY.same_cosine
@@ -205,8 +206,16 @@ def test_a_search_without_probabilities_has_none_in_its_summary():
     ],
 )
 def test_what_was_found_stands_where_probabilities_fail(error, monkeypatch):
-    found = loop()
-    progress = SimpleNamespace(first=None, state=None)
+    found, ended = closed_without_probabilities(error, monkeypatch)
+    assert ended.structures is None
+    assert ended.rounds == found.rounds
+    (note,) = ended.notes
+    assert note == f"{_loop.NO_PROBABILITIES}: {error}"
+
+
+def closed_without_probabilities(error, monkeypatch):
+    """What was found, and the loop that ends with an error where probabilities are computed."""
+    found, progress = loop(), SimpleNamespace(first=None, state=None)
 
     def fails(*_):
         raise error
@@ -216,11 +225,15 @@ def test_what_was_found_stands_where_probabilities_fail(error, monkeypatch):
         "_with_noise": lambda roles, _: roles, "loop_of": lambda *_: found, "probabilities": fails,
     }.items():  # fmt: skip
         monkeypatch.setattr(_loop, name, value)
-    ended = _loop.close_loop(None, None, None, known=progress)
-    assert ended.structures is None
-    assert ended.rounds == found.rounds
-    (note,) = ended.notes
-    assert note == f"{_loop.NO_PROBABILITIES}: {error}"
+    return found, _loop.close_loop(None, None, None, known=progress)
+
+
+@pytest.mark.parametrize(
+    "error", [ValueError("operands could not be broadcast"), InputError("no such effect", key="x")]
+)
+def test_mistakes_are_not_hidden_as_failures_of_numbers(error, monkeypatch):
+    with pytest.raises(type(error)):
+        closed_without_probabilities(error, monkeypatch)
 
 
 def test_rounding_leaves_no_probability_above_one():
