@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -76,7 +77,10 @@ def headline_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
     likely = structures.with_probability(summary) if len(summary["effects"]) == 1 else ""
     if likely and text.startswith(likely, first):
         first += len(likely)
-    return f"{text[:first]}.", begin(text[first:].lstrip(",;. "))
+    rest = text[first:].lstrip(",;. ")
+    subject = "It explains" if len(summary["effects"]) == 1 else "They explain"
+    # A title of its own leaves its participle without a sentence.
+    return f"{text[:first]}.", begin(re.sub("^explaining", subject, rest))
 
 
 def _not_tried(summary: Mapping[str, Any]) -> str:
