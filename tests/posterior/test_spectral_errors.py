@@ -63,7 +63,7 @@ def test_it_stays_inside_the_bounds_of_an_unknown():
 
 def test_derivatives_of_the_place_are_those_by_differences():
     problem, theta, _ = stretched(line(LogNormal(0.5, 1.0)), (3.0, 0.7))
-    errors, at = LogDensity(problem, errors="spectral").errors, theta + [0.03, -0.05]
+    errors, at = LogDensity(problem, errors="spectral").errors, theta + np.array([0.03, -0.05])
     steps = 1e-6 * np.eye(2)
     by_differences = (errors.moved(at + steps) - errors.moved(at - steps)) / 2e-6
     np.testing.assert_allclose(errors.slope(at), by_differences.T, rtol=1e-6, atol=1e-8)
