@@ -38,7 +38,7 @@ from bayesoleo.error_models._stretch import Stretch
 from bayesoleo.errors import ModelError
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._identifiability import multistart
-from bayesoleo.estimation._problem import ResidualProblem
+from bayesoleo.estimation._problem import ResidualProblem, undisturbed
 from bayesoleo.model._model import Model
 from bayesoleo.model._priors import Transforms
 from bayesoleo.posterior._hierarchy import hierarchical
@@ -452,10 +452,13 @@ def mixture_at(density: LogDensity, theta: Array, *, starts: int = 0, seed: int 
     if density.errors.word == CATALOGUE and isinstance(density.unknowns, PlainUnknowns):
         return _catalogue_mixture(density, theta)
     begins = [theta]
+    # Other starts lead to other branches of a motion, from which none leads back.
     if starts:
         rng = np.random.default_rng(seed)
-        begins += [mode.theta for mode in multistart(density.problem, starts, rng)]
-    mixture = laplace_mixture(density, np.array(begins))
+        with undisturbed(density.problem):
+            begins += [mode.theta for mode in multistart(density.problem, starts, rng)]
+    with undisturbed(density.problem):
+        mixture = laplace_mixture(density, np.array(begins))
     heaviest = density.split(mixture.centres[:1])[0]
     if isinstance(density.problem, CampaignProblem):
         density.problem.freeze(density.unknowns.theta(heaviest)[0])

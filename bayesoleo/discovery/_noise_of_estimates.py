@@ -84,6 +84,8 @@ class NoiseOfEstimates:
         matters = bool(np.max(share, initial=0.0) > MATTERS)
         shown = any(e.input_noise**2 > SHOWS * e.noise**2 for e in entries)
         beyond = not is_at_floor(ErrorTable(tuple(entries)), policy=fit.policy)
+        # The noise of inputs is known line by line. In what is left of a transient its peaks at
+        # resonances are wider: averages over neighbouring lines make them lower.
         coloured = {} if matters and not beyond else colours_of(fit)
         if coloured:
             own, inputs = coloured_surplus(fit, runs), 0.0 * inputs

@@ -207,7 +207,7 @@ def test_no_more_than_noise_is_not_said_where_more_is_left(tmp_path):
 def test_intervals_near_a_resonance_hold_the_truth(tmp_path):
     scores, white = [], []
     for seed in range(80):
-        fit = resonant(tmp_path, seed, noise=0.008)
+        fit = resonant(tmp_path, seed, noise=0.012)
         away = np.array([fit.values[n] - RESONANT[n] for n in fit.problem.names])
         white.append(away / fit.point.sd)
         scores.append(away / np.sqrt(np.diag(NoiseOfEstimates.of(fit).covariance)))
