@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from test_noise_of_inputs import COUNT, STEP, TIME, TRUTHS, drive, true_output
+from test_noise_of_inputs import COUNT, TIME, TRUTHS, drive, true_output
 
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._effects_beside_colour import gain_beside_colour
@@ -49,7 +49,9 @@ def law() -> Model:
 def fitted(kind: str, colour: str, seed: int, *, cubic: float = 0.0):
     rng = np.random.default_rng(seed)
     if kind == "law":
-        u, rate = drive(TIME), np.gradient(drive(TIME), STEP)
+        u = drive(TIME)
+        rate = (2.0 + 1.2 * TIME) * np.cos(2.0 * TIME + 0.6 * TIME**2)
+        rate += 0.55 * np.cos(1.1 * TIME)
         model, y = law(), 2.2 * u + 0.25 * rate + cubic * u**3
     else:
         model, y = TRUTHS[kind][0](), true_output(kind, cubic)
