@@ -142,7 +142,10 @@ def inference_for(
     """
     settings = task.settings
     inference = settings.inference
-    if fit.point.objective_name in (CATALOGUE, "correlated", "power") and fit.point.remarks:
+    if (
+        fit.point.objective_name in (CATALOGUE, "correlated", "power", "spectral")
+        and fit.point.remarks
+    ):
         return replace(inference, error_model=fit.point.objective_name, reason=fit.point.remarks[0])
     if inference.error_model not in (AUTO, CATALOGUE) or (
         inference.error_model == CATALOGUE and fit.problem.signatures is not None

@@ -251,8 +251,9 @@ class Settings:
     error_model : {"auto", "independent", "per-run", "full", "correlated", "discrepancy", ...}
         What the errors of the outputs have in common; see
         :mod:`bayesoleo.error_models`. By default the data decide: ``correlated`` where noise is
-        coloured, ``catalogue`` where more than noise is left (``power`` where that would let the
-        priors decide), else ``independent``.
+        coloured, ``spectral`` where that of measured inputs or of transients makes another
+        covariance of the estimate, ``catalogue`` where more than noise is left (``power`` where
+        that would let the priors decide, or explains nothing), else ``independent``.
     between_runs : tuple of str
         Parameters that scatter between runs about a mean that is estimated
         (:func:`bayesoleo.posterior.hierarchical`).
@@ -319,9 +320,10 @@ class Settings:
         "What errors have in common: independent (one variance an output), per-run, full "
         "(outputs correlated), correlated (in time), discrepancy (repeats every period), "
         "shared-discrepancy (and is partly alike in all runs), catalogue (all effects that the "
-        "model might lack), power (independent, by effective samples). The default, auto, "
-        "chooses among independent, correlated, catalogue and power by what the data show, and says"
-        " why.",
+        "model might lack), power (independent, by effective samples), spectral (independent, as "
+        "wide as the spectra of the noise make the estimate). The default, auto, chooses among "
+        "independent, correlated, catalogue, power and spectral by what the data show, and says "
+        "why.",
         metavar="NAME",
     )  # fmt: skip
     between_runs: tuple[str, ...] = _setting(

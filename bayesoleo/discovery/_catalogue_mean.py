@@ -28,6 +28,8 @@ _SMALL, _KNOWN = 0.1, 1.0
 #: Times that a step is halved, the part of a foreseen rise of the log density that must come, and
 #: what it may lack of that or fall below a foreseen fall.
 _HALVINGS, _SOME, _DOUBTED = 8, 0.25, 0.1
+#: Error of a sample from which on a motion has run away.
+_RUN_AWAY = 1e100
 #: How far below the mean's an effect's own density may lie where that effect acts alone.
 _FAR = 20.0
 
@@ -163,7 +165,8 @@ def _as_far_as_believed(about: _About, theta: Array, here: Evaluation, step: Arr
         trial = theta + length * step
         with undisturbed(about.problem):
             there = about.problem.evaluate(trial)
-        if there.status.ok:
+        # The squares of a motion that runs away overflow.
+        if there.status.ok and all(np.max(np.abs(e)) < _RUN_AWAY for e in there.residual):
             slopes = zip(here.residual, here.sensitivity, strict=True)
             rise = about.height(trial, [e - j @ (trial - theta) for e, j in slopes]) - before
             least = _SOME * rise if rise > 0.0 else rise

@@ -121,7 +121,7 @@ class EstimateCovariance:
 
 
 @dataclass(frozen=True)
-class _LinearisedRun:
+class LinearisedRun:
     """One run in terms of some unknowns, outputs apart.
 
     Parameters
@@ -153,7 +153,7 @@ class _LinearisedRun:
     @classmethod
     def of(
         cls, record: Record, found: Compared, sensitivity: Array, weight: Array
-    ) -> _LinearisedRun:
+    ) -> LinearisedRun:
         entries, columns = found
         counts = weights(record)
         raw, columns = sensitivity * counts, columns * counts
@@ -213,13 +213,9 @@ def expected_of_fitted(
         the fit has no covariance.
     """
     names, response = fit.problem.names, fit.point.covariance
-    if not np.isfinite(response).all() or not all(p.status.ok for p in fitted):
+    runs = linearised_runs(fit, fitted, found)
+    if not runs:
         return [entry for entries, _ in found for entry in entries], {}
-    free = [fit.predictor.layout.names.index(name) for name in names]
-    runs = [
-        _LinearisedRun.of(p.record, one, predicted.sensitivity[:, free], 1.0 / fit.point.variance)
-        for p, one, predicted in zip(fitted, found, fit.predictions, strict=True)
-    ]
     surplus = sum((run.scatter - run.information for run in runs), np.zeros_like(response))
     covariance = response + response @ surplus @ response
     entries = [
@@ -233,9 +229,22 @@ def expected_of_fitted(
     return entries, known
 
 
+def linearised_runs(
+    fit: ModelFit, fitted: Sequence[Prediction], found: Sequence[Compared]
+) -> list[LinearisedRun]:
+    """The fitted runs in terms of the unknowns; none where the fit has no covariance."""
+    if not np.isfinite(fit.point.covariance).all() or not all(p.status.ok for p in fitted):
+        return []
+    free = [fit.predictor.layout.names.index(name) for name in fit.problem.names]
+    return [
+        LinearisedRun.of(p.record, one, predicted.sensitivity[:, free], 1.0 / fit.point.variance)
+        for p, one, predicted in zip(fitted, found, fit.predictions, strict=True)
+    ]
+
+
 def _left(
     entry: RunError,
-    run: _LinearisedRun,
+    run: LinearisedRun,
     output: int,
     response: Array,
     covariance: Array,
@@ -250,7 +259,7 @@ def _left(
 
 def _with(
     entry: RunError,
-    run: _LinearisedRun,
+    run: LinearisedRun,
     output: int,
     square: float,
     parameters: Array,
@@ -286,7 +295,7 @@ def _coefficients(entry: RunError, inputs: Array) -> float:
 
 
 def _without(
-    names: tuple[str, ...], response: Array, surplus: Array, run: _LinearisedRun, label: str
+    names: tuple[str, ...], response: Array, surplus: Array, run: LinearisedRun, label: str
 ) -> EstimateCovariance:
     """What a fit to all runs but one would know, by linearisation at the fit to all."""
     keep = [k for k, name in enumerate(names) if not name.endswith(f"[{label}]")]
@@ -331,7 +340,7 @@ def expected_of_held_out(
     re_estimated = prediction.re_estimated > 0
     own = np.array([re_estimated and name not in mine.names for name in names], dtype=np.bool_)
     sigma = np.array([max(entry.sigma, 1e-300) for entry in entries])
-    run = _LinearisedRun.of(prediction.record, found, at_estimate, sigma**-2)
+    run = LinearisedRun.of(prediction.record, found, at_estimate, sigma**-2)
     shared = mine.of(names)
     response, moved = _own_response(predictor, run, own)
     shared = moved @ shared @ moved.T
@@ -359,7 +368,7 @@ def most_by_chance(square: float, policy: SearchPolicy) -> float:
 
 
 def _own_response(
-    predictor: Predictor, run: _LinearisedRun, own: NDArray[np.bool_]
+    predictor: Predictor, run: LinearisedRun, own: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
     """Response of the by-run unknowns to the residual ``(l, l)``, and the map from errors of the
     shared unknowns to errors of all ``(l, l)``."""

@@ -14,13 +14,15 @@ from bayesoleo._parallel import single_blas_thread
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Assembly
 from bayesoleo.discovery._catalogue_mean import linearised_of, shifted
+from bayesoleo.discovery._effects_beside_colour import gain_beside_colour
 from bayesoleo.discovery._fit import ModelFit
-from bayesoleo.discovery._noise_of_inputs import NoiseOfInputs
+from bayesoleo.discovery._noise_of_estimates import NoiseOfEstimates
 from bayesoleo.discovery._run_predictions import Prediction
 from bayesoleo.discovery._scanned_columns import Scanned
 from bayesoleo.discovery._signatures import (
     COLOUR_FALSE_ALARM,
     FittedSignatures,
+    Noise,
     more_than_noise_p,
     noise_of,
 )
@@ -31,11 +33,14 @@ from bayesoleo.error_models._correlated import CorrelatedErrors, PowerErrors, ef
 from bayesoleo.error_models._fitting import derivatives
 from bayesoleo.error_models._independent import IndependentErrors
 from bayesoleo.error_models._registry import AUTO, ERROR_MODELS, check_word
+from bayesoleo.error_models._spectral import SpectralErrors
+from bayesoleo.error_models._stretch import Stretch
 from bayesoleo.errors import ModelError
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._identifiability import multistart
-from bayesoleo.estimation._problem import ResidualProblem
+from bayesoleo.estimation._problem import ResidualProblem, undisturbed
 from bayesoleo.model._model import Model
+from bayesoleo.model._priors import Transforms
 from bayesoleo.posterior._hierarchy import hierarchical
 from bayesoleo.posterior._laplace import (
     Mode,
@@ -118,9 +123,9 @@ class Inference:
         """The log posterior density of a fitted model; the solver starts from the estimate."""
         problem, point = fit.problem, fit.point
         unknowns = None
-        if self.error_model == PowerErrors.word:
-            most = np.asarray(problem.counts) / NoiseOfInputs.of(fit).inflation
-            problem.effective = np.minimum(effective_at(problem, point.theta), most)
+        # The covariance of a fit that was moved to the mode under these errors contains them.
+        if point.objective_name != self.error_model:
+            _tell(self.error_model, fit)
         if self.between_runs:
             unknowns = hierarchical(
                 problem, self.between_runs, theta=point.theta, errors=self.error_model
@@ -129,6 +134,17 @@ class Inference:
         density = LogDensity(problem, jobs, errors=self.error_model, unknowns=unknowns)
         density.reason = self.reason
         return density
+
+
+def _tell(word: str, fit: ModelFit) -> None:
+    """Tell the problem what an error model needs to know of the estimate."""
+    problem, theta = fit.problem, fit.point.theta
+    if word == PowerErrors.word:
+        most = np.asarray(problem.counts) / NoiseOfEstimates.of(fit).inflation
+        problem.effective = np.minimum(effective_at(problem, theta), most)
+    if word == SpectralErrors.word:
+        known, transforms = NoiseOfEstimates.of(fit), Transforms.of(problem.priors)
+        problem.stretch = Stretch.of(transforms, theta, known.stated, known.covariance)
 
 
 def effective_at(problem: ResidualProblem, theta: Array) -> Array:
@@ -144,10 +160,10 @@ _FEWEST = 20
 _PLAIN = "the noise is white, and no more than noise is left"
 _COLOURED = "the spectrum of the noise of {} is not flat (p = {:.1g})"
 _LEFT = "more than noise is left: log odds {:.0f} against noise alone"
-_BY_INPUTS = (
-    "power errors, chosen because noise of measured inputs reaches the outputs, and no more than"
-    " noise is left"
-)
+_BY_INPUTS = "noise of measured inputs reaches the outputs, and no more than noise is left"
+_NOT_FLAT = "the spectrum of what is left of {} in transients is not flat (p {})"
+_NO_EFFECT = ", and no effect of the catalogue explains it better"
+_BEYOND = "more than noise is left, and no effect of the catalogue explains it"
 _UNDECIDED = "effects that the data do not tell apart are left: {}"
 #: Probability of a residual by noise alone below which effects of the catalogue are looked for in
 #: it. Of 145 residuals of simulated campaigns that the catalogue explained better than noise, with
@@ -213,30 +229,66 @@ def chosen_for(
             inference, error_model=plain, reason=f"the estimate: {fit.point.status.message}"
         )
     noise = noise_of(fit)
-    if word == AUTO and not undecided and more_than_noise_p(fit, noise) > LOOKED_FOR:
-        word, reason = error_model_by(noise.p_value, lambda _: -np.inf, fit.predictor.outputs)
-        return replace(inference, error_model=word, reason=reason)
-    if word == AUTO and not undecided and NoiseOfInputs.of(fit).alone:
-        # Its colour is that of the model's resonances: effects of the catalogue would imitate it.
-        return replace(inference, error_model=PowerErrors.word, reason=_BY_INPUTS)
-    found = FittedSignatures.of(
+    if word == AUTO and not undecided:
+        found = _without_catalogue(fit, noise)
+        if found is not None:
+            return replace(inference, error_model=found[0], reason=found[1])
+    signatures = FittedSignatures.of(
         fit, assembly, noise, effects=effects, held_out=held_out, scanned=scanned, jobs=jobs
     )
-    fit.problem.signatures = found.signatures
+    fit.problem.signatures = signatures.signatures
     if word == CATALOGUE:
-        fit.problem.signatures = found.with_curves(jobs)
+        fit.problem.signatures = signatures.with_curves(jobs)
         return inference
-    word, reason = error_model_by(
-        noise.p_value,
-        lambda _: linearised_of(fit.problem, fit.point.theta).log_odds,
-        fit.predictor.outputs,
-        undecided,
-    )
+    known = NoiseOfEstimates.of(fit)
+
+    def rise(_: bool) -> float:
+        # Beside white noise effects explain slow noise too.
+        if known.coloured and not undecided:
+            beside = gain_beside_colour(fit, signatures.signatures)
+            if beside < MORE_THAN_NOISE:
+                return beside
+        return linearised_of(fit.problem, fit.point.theta).log_odds
+
+    word, reason = error_model_by(noise.p_value, rise, fit.predictor.outputs, undecided)
     if word == CATALOGUE:
         word, reason = _unless_priors_decide(fit, reason)
+    else:
+        word, reason = _by_spectra(known, word, reason, asked=True)
     # Curves are for draws: what runs that were not fitted need of them is computed for these only.
-    fit.problem.signatures = found.with_curves(jobs) if word == CATALOGUE else None
+    fit.problem.signatures = signatures.with_curves(jobs) if word == CATALOGUE else None
     return replace(inference, error_model=word, reason=reason)
+
+
+def _without_catalogue(fit: ModelFit, noise: Noise) -> tuple[str, str] | None:
+    """The error model and the reason where effects of the catalogue need not be looked for."""
+    as_noise, known = more_than_noise_p(fit, noise) > LOOKED_FOR, NoiseOfEstimates.of(fit)
+    # The colour of inputs' noise is that of the model's resonances: effects would imitate it.
+    if not (as_noise and not known.beyond) and not (known.inputs_alone and known.shown):
+        return None
+    word, reason = error_model_by(noise.p_value, lambda _: -np.inf, fit.predictor.outputs)
+    return _by_spectra(known, word, reason)
+
+
+def _by_spectra(
+    known: NoiseOfEstimates, word: str, reason: str, *, asked: bool = False
+) -> tuple[str, str]:
+    """An error model of noise alone, or another one where the spectra or the size of what is left
+    say that intervals would be wrong; ``asked`` is whether effects were looked for."""
+    spectral, power = SpectralErrors.word, PowerErrors.word
+    if known.inputs_alone:
+        return spectral, f"{spectral}{_BECAUSE}{_BY_INPUTS}"
+    if word != ERROR_MODELS[0]:
+        return word, reason
+    if known.coloured:
+        output = min(known.coloured, key=known.coloured.__getitem__)
+        p_value, least = known.coloured[output], 1e-12
+        chance = f"= {p_value:.1g}" if p_value > least else f"< {least:.0g}"
+        left = _NOT_FLAT.format(output, chance) + (_NO_EFFECT if asked else "")
+        return spectral, f"{spectral}{_BECAUSE}{left}"
+    if known.beyond:
+        return power, f"{power}{_BECAUSE}{_BEYOND}"
+    return word, reason
 
 
 def _unless_priors_decide(fit: ModelFit, reason: str) -> tuple[str, str]:
@@ -400,10 +452,13 @@ def mixture_at(density: LogDensity, theta: Array, *, starts: int = 0, seed: int 
     if density.errors.word == CATALOGUE and isinstance(density.unknowns, PlainUnknowns):
         return _catalogue_mixture(density, theta)
     begins = [theta]
+    # Other starts lead to other branches of a motion, from which none leads back.
     if starts:
         rng = np.random.default_rng(seed)
-        begins += [mode.theta for mode in multistart(density.problem, starts, rng)]
-    mixture = laplace_mixture(density, np.array(begins))
+        with undisturbed(density.problem):
+            begins += [mode.theta for mode in multistart(density.problem, starts, rng)]
+    with undisturbed(density.problem):
+        mixture = laplace_mixture(density, np.array(begins))
     heaviest = density.split(mixture.centres[:1])[0]
     if isinstance(density.problem, CampaignProblem):
         density.problem.freeze(density.unknowns.theta(heaviest)[0])

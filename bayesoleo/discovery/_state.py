@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from bayesoleo.discovery._fit_and_hold_out_error import (
     too_quiet,
     with_same_noise,
 )
+from bayesoleo.discovery._noise_of_estimates import NoiseOfEstimates, colours_of
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._run_predictions import Prediction, predict_fitted, predict_held_out
 from bayesoleo.discovery._score_basis import Base, base_of
@@ -104,9 +106,19 @@ class State:
         names = self.fit.problem.names
         if unknown not in names:
             return None
-        if self.known is not None:
-            return float(np.sqrt(self.known.of([unknown])[0, 0]))
+        known = self._by_colour or self.known
+        if known is not None:
+            return float(np.sqrt(known.of([unknown])[0, 0]))
         return float(self.fit.point.sd[names.index(unknown)])
+
+    @cached_property
+    def _by_colour(self) -> EstimateCovariance | None:
+        """To what estimates are known by the spectrum of what is left of transients; None where
+        that is flat. Differences of neighbours, by which noise is measured, miss what is slow."""
+        if not colours_of(self.fit):
+            return None
+        covariance = NoiseOfEstimates.of(self.fit).covariance
+        return EstimateCovariance(self.fit.problem.names, covariance)
 
     @property
     def policy(self) -> SearchPolicy:

@@ -183,6 +183,14 @@ def noise_along(direction: Array, left: Array) -> float:
     return coloured_variance([direction], [RunNoise(left, nothing, np.zeros((0, 0)))])[0]
 
 
+def scatter_of(run: RunNoise) -> Array:
+    """Covariance of ``J' e`` in one run's noise ``e``, shape (l, l)."""
+    columns, size = run.transformed, len(run.transformed)
+    coloured = np.einsum("abk,lbk->lak", run.level * run.lines.weights / run.samples, columns)
+    found: Array = (columns.reshape(size, -1).conj() @ coloured.reshape(size, -1).T).real
+    return found
+
+
 def _of_run(weights: Array, run: RunNoise) -> tuple[float, float]:
     along, lines = scipy.fft.rfft(weights), run.lines
     power = np.einsum("ak,abk,bk->k", along.conj(), run.level, along).real

@@ -41,3 +41,6 @@ from ._registry import (
 from ._signatures import (
     Signatures as Signatures,
 )
+from ._spectral import (
+    SpectralErrors as SpectralErrors,
+)

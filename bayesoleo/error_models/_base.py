@@ -19,6 +19,7 @@ from scipy.special import ndtr, ndtri
 from bayesoleo import _schema as schema
 from bayesoleo._types import Array, Int, Integers
 from bayesoleo.error_models._signatures import Signatures
+from bayesoleo.error_models._stretch import Stretch
 from bayesoleo.errors import InputError
 from bayesoleo.model._priors import Prior, Transform, Uniform
 
@@ -164,6 +165,8 @@ class Frame:
         Of the effects that the model might lack, if they are known.
     effective : ndarray, shape (N, s), or None
         Effective number of independent samples, if it is known.
+    stretch : Stretch or None
+        To the covariance of the estimate by the spectra of the noise, if it is known.
     """
 
     outputs: tuple[str, ...]
@@ -173,6 +176,7 @@ class Frame:
     log_variance_prior: Mapping[str, Prior]
     signatures: Signatures | None = None
     effective: Array | None = None
+    stretch: Stretch | None = None
 
     @classmethod
     def of(cls, problem: Measured, log_variance_prior: Mapping[str, Prior] | None = None) -> Frame:
@@ -186,6 +190,7 @@ class Frame:
             dict(log_variance_prior or {}),
             getattr(problem, "signatures", None),
             getattr(problem, "effective", None),
+            getattr(problem, "stretch", None),
         )
 
     def log_variances(self) -> tuple[Quantity, ...]:
@@ -301,6 +306,15 @@ class ErrorModel(ABC):
     def sample_prior(self, rng: np.random.Generator, size: int) -> dict[str, Array]:
         """Draws of the quantities that have a proper prior, each of shape (size,)."""
         return {q.name: q.prior.sample(rng, size) for q in self.quantities if q.prior is not None}
+
+    def moved(self, theta: Array) -> Array:
+        """Where the problem's residuals are taken for unknowns (L, l): there, unless a model says
+        otherwise."""
+        return theta
+
+    def slope(self, theta: Array) -> Array:
+        """Derivatives of that place with respect to theta (l,), shape (l, l)."""
+        return np.eye(len(theta))
 
     def of_sums(self, sums: Array, eta: Array) -> Array:
         """Normalised log-likelihood by run, shape (L, N), of sums (L, N, s); eta (L, m)."""

@@ -15,6 +15,7 @@ word                   errors
 ``shared-discrepancy`` as ``discrepancy``, with a part of the process that all runs share
 ``catalogue``          all effects that the model might lack, and a smooth remainder
 ``power``              as ``independent``, the likelihood to the power of the effective samples
+``spectral``           as ``independent``, as wide as the noise's spectra make the estimate
 ``common``             one variance for all outputs; eliminated only
 ``given``              known variances or covariances; eliminated only
 ====================== =============================================================================
@@ -36,6 +37,7 @@ from bayesoleo.error_models._independent import (
     ProfiledCommonErrors,
     ProfiledIndependentErrors,
 )
+from bayesoleo.error_models._spectral import SpectralErrors
 from bayesoleo.errors import InputError, choose
 from bayesoleo.model._priors import Prior
 
@@ -57,6 +59,7 @@ _REGISTRY = {
     "shared-discrepancy": _Forms(SharedDiscrepancyErrors, None),
     "catalogue": _Forms(CatalogueErrors, None),
     "power": _Forms(PowerErrors, None),
+    "spectral": _Forms(SpectralErrors, None),
     "common": _Forms(None, ProfiledCommonErrors),
     "given": _Forms(None, GivenErrors),
 }

@@ -12,6 +12,7 @@ from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array, Integers
 from bayesoleo.error_models._base import RunSamples
 from bayesoleo.error_models._signatures import Signatures
+from bayesoleo.error_models._stretch import Stretch
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._least_squares import BatchNormalEquations, reduce_rows
 from bayesoleo.estimation._problem import Evaluation, Misfit
@@ -45,6 +46,8 @@ class CampaignProblem:
         self.signatures: Signatures | None = None
         #: Effective number of samples by run and output, if it was computed.
         self.effective: Array | None = None
+        #: To the covariance of the estimate by the spectra of the noise, if it was computed.
+        self.stretch: Stretch | None = None
         layout = predictor.layout
         self._all_priors = layout.priors(predictor.model)
         self._free = np.arange(len(layout.names)) if free is None else free

@@ -253,7 +253,10 @@ def _at_draws(
 
     def work(rows: slice) -> None:
         residuals = [problem.residuals(theta[rows], run)[0] for run in range(len(blocks))]
-        found = density.errors.of_blocks(residuals, eta[rows], [part.starts for part in blocks])
+        moved, of_density = density.errors.moved(theta[rows]), residuals
+        if not np.array_equal(moved, theta[rows]):
+            of_density = [problem.residuals(moved, run)[0] for run in range(len(blocks))]
+        found = density.errors.of_blocks(of_density, eta[rows], [part.starts for part in blocks])
         likelihood[rows] = np.concatenate(found, axis=2)
         for run, (e, part) in enumerate(zip(residuals, blocks, strict=True)):
             columns = slice(ends[run], ends[run + 1])

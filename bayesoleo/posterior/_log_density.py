@@ -176,6 +176,7 @@ def residuals_at(problem: EstimationProblem, errors: ErrorModel, theta: Array) -
         If they cannot be computed.
     """
     parts, status = [], Status.CONVERGED
+    theta = errors.moved(theta[None])[0]
     if errors.by_sums:
         misfit = problem.misfit(theta[None])
         status = Status(int(misfit.status[0]))
@@ -214,7 +215,7 @@ def information_at(
     ----------
     Verbeek (1993), eq. 3.19: ``A``.
     """
-    evaluation = problem.evaluate(theta)
+    evaluation = problem.evaluate(errors.moved(theta[None])[0])
     if not evaluation.status.ok:
         return np.zeros((len(theta), len(theta)))
     counts = np.asarray(problem.counts)
@@ -223,7 +224,8 @@ def information_at(
         [j[a:b].T for j, a, b in zip(evaluation.sensitivity, first, last, strict=True)]
         for first, last in zip(ends - counts, ends, strict=True)
     ]
-    return errors.products_of_all(by_run, eta)
+    slope = errors.slope(theta)
+    return slope.T @ errors.products_of_all(by_run, eta) @ slope
 
 
 class Density(Protocol):
@@ -392,7 +394,7 @@ class LogDensity:
         by_run = np.full((len(phi), len(self.runs)), -np.inf)
         inside = np.flatnonzero(status == Status.CONVERGED)
         if inside.size:
-            theta = self.unknowns.theta(block[inside])
+            theta = self.errors.moved(self.unknowns.theta(block[inside]))
             # Infinite or overflowing terms are identified below by their status.
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
                 likelihood = self._of_sums if self.errors.by_sums else self._of_residuals

@@ -16,8 +16,8 @@ from bayesoleo.data import periodic_average
 from bayesoleo.data._noise import local_average
 from bayesoleo.discovery._assembly import Assembly, RecordNoise, assign
 from bayesoleo.discovery._expected_error import (
+    LinearisedRun,
     _left,
-    _LinearisedRun,
     _own_response,
     expected_of_fitted,
 )
@@ -272,7 +272,7 @@ def reduced_run(sensitivity, noise, weight):
     entry = replace(entry, average=replace(entry.average, sigma=noise, noise=noise, number=size))
     nothing = np.zeros((1, 0, size))
     weights = np.array([weight])
-    return entry, _LinearisedRun.of(record, ([entry], nothing), sensitivity[None], weights)
+    return entry, LinearisedRun.of(record, ([entry], nothing), sensitivity[None], weights)
 
 
 def test_a_fitted_run_leaves_what_its_degrees_of_freedom_say():

@@ -10,7 +10,9 @@ from bayesoleo.error_models import ERROR_MODELS, error_model
 from bayesoleo.error_models._base import RunSamples
 from bayesoleo.error_models._correlated import covariance
 from bayesoleo.error_models._discrepancy import basis, spectrum
+from bayesoleo.error_models._stretch import Stretch
 from bayesoleo.errors import InputError
+from bayesoleo.model._priors import Transforms
 from bayesoleo.posterior._datatree import sd_of_averages
 
 
@@ -25,11 +27,14 @@ class Campaign:
     frequency: float | None = 0.5
     counts: np.ndarray = field(init=False)
     effective: np.ndarray = field(init=False)
+    stretch: Stretch = field(init=False)
 
     def __post_init__(self):
         self.counts = np.array([[n] * len(self.outputs) for n in self.lengths])
         # Of the power likelihood.
         self.effective = 0.4 * self.counts
+        # Of the spectral one.
+        self.stretch = Stretch(Transforms(()), np.zeros(0), np.eye(0))
 
     @property
     def samples(self):
