@@ -208,7 +208,7 @@ def equidistant(n: int) -> Mesh:
 
 
 def graded(mesh: Mesh, ratio: float = GRADING) -> Mesh:
-    """Cut steps until neighbours differ by a factor at most.
+    """Cut steps until neighbours differ by a factor, or by thrice that where pieces meet.
 
     Parameters
     ----------
@@ -217,13 +217,16 @@ def graded(mesh: Mesh, ratio: float = GRADING) -> Mesh:
         The factor, above one.
     """
     lengths = np.diff(mesh.edges)
-    # How long pieces may be at the beginning of each step, to shrink to those on its right.
-    right = lengths.copy()
+    # How long pieces have become at the end of each step from those on its left, and may be at its
+    # beginning to shrink to those on its right.
+    left, right = lengths.copy(), lengths.copy()
+    for n in range(1, lengths.size):
+        left[n] = min(left[n], ratio * left[n - 1] + (ratio - 1) * lengths[n])
     for n in range(lengths.size - 2, -1, -1):
         right[n] = min(right[n], ratio * right[n + 1] + (ratio - 1) * lengths[n])
     edges = [0.0]
     for n, length in enumerate(lengths):
-        before = edges[-1] - edges[-2] if n > 0 else length
+        before = left[n - 1] if n > 0 else length
         after = right[n + 1] if n + 1 < lengths.size else length
         edges += _cut(mesh.edges[n], length, before, after, ratio)
     edges[-1] = 1.0
