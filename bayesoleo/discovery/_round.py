@@ -69,6 +69,8 @@ class Round:
     on_trial: bool = False
     #: What the candidates change in the outputs, where it was kept.
     _scanned: Scanned | None = field(default=None, compare=False, repr=False)
+    #: The next round, where it was looked at before this one ended.
+    _ahead: Round | None = field(default=None, compare=False, repr=False)
 
 
 def examine(
@@ -130,12 +132,14 @@ def examine(
     refits = _refit_best(base, ranking, tests, numerics, callback)
     ranking = rank(scores, tests, refits, base=base, policy=policy)
     accepted, after, reason = _choose(state, base, ranking, refits, roles, numerics, callback)
-    pair = None
+    pair, looked = None, list[Round]()
     if ahead and accepted is not None and _explains_nothing(refits[id(accepted.score)]):
 
         def follow(one: State) -> tuple[Ranked | None, State | None]:
-            then = examine(one, roles, numerics, effects=effects, seed=seed, callback=callback)
-            return then.accepted, then.after
+            looked.append(
+                examine(one, roles, numerics, effects=effects, seed=seed, callback=callback)
+            )
+            return looked[-1].accepted, looked[-1].after
 
         pair = confirmed_together(state, ranking, refits, roles, numerics, follow, callback)
         accepted, after, reason = pair or (accepted, after, reason)
@@ -144,9 +148,11 @@ def examine(
         accepted, after = None, None
     scanned = scanned if after is None else None  # of a model that is final
     trial = pair is not None and after is not None
+    then = next((one for one in looked if one.before is after), None)
     return Round(
-        state, ranking, failed, accepted, after, reason, tests, on_trial=trial, _scanned=scanned
-    )
+        state, ranking, failed, accepted, after, reason, tests,
+        on_trial=trial, _scanned=scanned, _ahead=then,
+    )  # fmt: skip
 
 
 def _explains_nothing(result: Refit) -> bool:

@@ -7,7 +7,7 @@ import pytest
 from fitted_states import NUMERICS
 from scipy.integrate import solve_ivp
 
-import bayesoleo.discovery._refit as refits
+from bayesoleo.discovery import _fit as fits, _refit as refits
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._fit import _likeliest
 from bayesoleo.discovery._ranking import score_candidates
@@ -95,6 +95,24 @@ def test_the_likeliest_start_is_taken(scored: tuple[Base, Score]) -> None:
     best = scored[0].fit.point.theta
     starts = np.array([1.3 * best, best, 1.01 * best])
     assert np.array_equal(_likeliest(problem, starts), best)
+
+
+def test_starts_beyond_some_that_are_worse_are_not_looked_at(
+    scored: tuple[Base, Score], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = scored[0].fit.problem
+    best = scored[0].fit.point.theta
+    asked: list[float] = []
+    cost = fits._cost
+
+    def counted(problem, vectors):
+        asked.extend(vectors[:, 0] / best[0])
+        return cost(problem, vectors)
+
+    monkeypatch.setattr(fits, "_cost", counted)
+    starts = np.outer([3.0, 1.3, 1.2, 1.1, 1.0, 1.01], best)
+    assert np.array_equal(_likeliest(problem, starts), best)
+    assert asked == pytest.approx([1.01, 1.0, 1.1, 1.2])
 
 
 def test_the_first_start_is_taken_where_the_last_cannot_be_solved(
