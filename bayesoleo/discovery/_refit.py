@@ -30,7 +30,7 @@ from bayesoleo.prediction._predictor import Layout, RunPrediction
 from bayesoleo.prediction._records import Record
 
 #: Parts of the values that a score expects, from which an estimate may start.
-STARTS = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 64, 1 / 256)
+STARTS = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 64, 1 / 256, 1 / 2**12, 1 / 2**16)
 
 
 @dataclass(frozen=True)
