@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from scipy import stats
@@ -71,6 +71,8 @@ RESOLUTION = 1e-3
 #: the best by 0.01, or by one where iterations gain a tenth each: as much as the steps of its mesh
 #: may change. In effects of a measured pendulum half of all iterations gained less than that.
 COMPARED = 0.1
+#: Iterations of an estimate on all steps, of each estimator, after one that did not end on fewer.
+MORE = 10
 #: Starts of one estimate, each farther from the present one, that are worse than the best before
 #: the others are not looked at.
 GIVEN_UP = 2
@@ -395,10 +397,11 @@ def fit_model(
     }  # fmt: skip
     problem = _begun(model, records, numerics, share)
     if check_mesh and start is not None and _has_fewer_steps(problem):
-        start = _look(
-            model, records, numerics, start,
-            max_iterations=max_iterations, share=share, damped=damped, method=method,
-        )  # fmt: skip
+        rough = _problem(model, records, numerics, _rough_steps(problem), share)
+        found = _look(rough, start, method, damped, limits, numerics.policy)
+        start = start if found is None else found.theta
+        if found is not None and not found.status.ok:
+            limits["max_iterations"] = min(max_iterations, MORE)
     while True:
         for run in problem.predictor.runs:
             # Nobody is told on which branch a model stands that is only compared with others, and
@@ -433,28 +436,35 @@ def fit_model(
 def _has_fewer_steps(problem: CampaignProblem) -> bool:
     """Whether an estimate may begin on fewer steps than it needs to end. Those of records so long
     that inputs choose their steps do so anyway."""
-    predictor = problem.predictor
+    predictor, steps = problem.predictor, problem.predictor.steps
     if not predictor.model.dofs or any(run.is_long for run in predictor.runs):
         return False
     periodic = [record.periodic for record in predictor.records]
     if not any(periodic):
         return True
-    enough = predictor.steps >= 2 * coarsest_steps(predictor.records, predictor.steps)
-    return all(periodic) and predictor.solver == COLLOCATION and enough
+    return all(periodic) and predictor.solver == COLLOCATION and _rough_steps(problem) < steps
+
+
+def _rough_steps(problem: CampaignProblem) -> int:
+    """Steps for a first look."""
+    predictor = problem.predictor
+    return 2 * coarsest_steps(predictor.records, predictor.steps)
 
 
 def _look(
-    model: Model, records: Sequence[Record], numerics: Numerics, start: Array, **how: Any
-) -> Array:
-    """Where an estimate arrives from a start on the fewest steps that show no difference; the
-    start where it was lost. Most iterations then take a part of their time."""
-    steps = coarsest_steps(records, whole_steps(model, records))
-    found = fit_model(
-        model, records, replace(numerics, steps=steps), start=start, tolerance=1e-4,
-        check_mesh=False, **how,
-    )  # fmt: skip
-    usable = found.point.status in (Status.CONVERGED, Status.NO_CONVERGENCE)
-    return found.point.theta if usable else start
+    rough: CampaignProblem,
+    start: Array,
+    method: str,
+    damped: bool,
+    limits: dict[str, float],
+    policy: SearchPolicy,
+) -> PointEstimate | None:
+    """The mode from a start on fewer steps, from where it is near; None where it was lost. Most
+    iterations then take a part of their time."""
+    for run in rough.predictor.runs:
+        run.watched = False
+    _, point = _estimated(rough, start, method, damped, limits, policy, lambda _: None)
+    return point if point.status in (Status.CONVERGED, Status.NO_CONVERGENCE) else None
 
 
 def _estimated(

@@ -131,7 +131,10 @@ def examine(
         return Round(state, ranking, failed, None, None, stop or limit, tests, _scanned=scanned)
     refits = _refit_best(base, ranking, tests, numerics, callback)
     ranking = rank(scores, tests, refits, base=base, policy=policy)
-    accepted, after, reason = _choose(state, base, ranking, refits, roles, numerics, callback)
+    fitted: dict[int, State] = {}
+    accepted, after, reason = _choose(
+        state, base, ranking, refits, roles, numerics, callback, fitted
+    )
     pair, looked = None, list[Round]()
     if ahead and accepted is not None and _explains_nothing(refits[id(accepted.score)]):
 
@@ -141,7 +144,7 @@ def examine(
             )
             return looked[-1].accepted, looked[-1].after
 
-        pair = confirmed_together(state, ranking, refits, roles, numerics, follow, callback)
+        pair = confirmed_together(state, ranking, refits, roles, numerics, follow, callback, fitted)
         accepted, after, reason = pair or (accepted, after, reason)
     if accepted is not None and after is not None and np.isnan(after.worst_ratio):
         reason = f"with {accepted.effect} a run has no solution at the estimate"
@@ -278,8 +281,9 @@ def _choose(
     roles: Roles,
     numerics: Numerics,
     callback: ProgressCallback,
+    fitted: dict[int, State] | None = None,
 ) -> tuple[Ranked | None, State | None, str]:
-    """The best effect that the hold-out runs confirm.
+    """The best effect that the hold-out runs confirm; ``fitted`` keeps what was fitted for that.
 
     Among effects that leave only noise on the fitted runs and have nearly the same penalised sum
     of squares there, the first that also leaves only noise on the hold-out runs is chosen.
@@ -299,7 +303,9 @@ def _choose(
         result = refits[id(item.score)]
         if found is not None and not _as_good(base, result, refits[id(found[0].score)]):
             continue
-        after, reason = confirmed(state, item, result, roles, numerics, callback, on_trial=True)
+        after, reason = confirmed(
+            state, item, result, roles, numerics, callback, on_trial=True, fitted=fitted
+        )
         if after is None:
             reasons.append(reason)
         elif after.at_floor or not result.reached:
