@@ -71,7 +71,8 @@ RESOLUTION = 1e-3
 #: the best by 0.01, or by one where iterations gain a tenth each: as much as the steps of its mesh
 #: may change. In effects of a measured pendulum half of all iterations gained less than that.
 COMPARED = 0.1
-#: Iterations of an estimate on all steps, of each estimator, after one that did not end on fewer.
+#: Iterations of MBE on all steps after a mode on fewer, and of BE where that was not reached: MBE
+#: creeps where the data leave an unknown open.
 MORE = 10
 #: Starts of one estimate, each farther from the present one, that are worse than the best before
 #: the others are not looked at.
@@ -395,19 +396,22 @@ def fit_model(
     limits = {
         "tolerance": tolerance, "max_iterations": max_iterations, "resolution": resolution
     }  # fmt: skip
-    problem = _begun(model, records, numerics, share)
+    problem, few = _begun(model, records, numerics, share), max_iterations
     if check_mesh and start is not None and _has_fewer_steps(problem):
         rough = _problem(model, records, numerics, _rough_steps(problem), share)
         found = _look(rough, start, method, damped, limits, numerics.policy)
         start = start if found is None else found.theta
+        few = few if found is None else min(max_iterations, MORE)
         if found is not None and not found.status.ok:
-            limits["max_iterations"] = min(max_iterations, MORE)
+            limits["max_iterations"] = few
     while True:
         for run in problem.predictor.runs:
             # Nobody is told on which branch a model stands that is only compared with others, and
             # to follow a branch takes as long as to solve.
             run.watched = check_mesh
-        mbe, point = _estimated(problem, start, method, damped, limits, numerics.policy, callback)
+        mbe, point = _estimated(
+            problem, start, method, damped, limits, numerics.policy, callback, few
+        )
         problem.freeze(point.theta)
         predictions = problem.predictor.predict(problem.full(point.theta[None])[0])
         mesh = _error_of_mesh(problem, point, predictions, numerics, check_mesh)
@@ -475,13 +479,16 @@ def _estimated(
     limits: dict[str, float],
     policy: SearchPolicy,
     callback: Callable[[str], None],
+    few: int | None = None,
 ) -> tuple[PointEstimate, PointEstimate]:
-    """The estimate by a method and the mode, on one mesh; parameters as of :func:`fit_model`."""
+    """The estimate by a method, in a few iterations where it began with a mode, and the mode, on
+    one mesh; parameters as of :func:`fit_model`."""
     several = start is not None and start.ndim == 2
     first = _likeliest(problem, start) if start is not None and several else start
     callback(f"{method.upper()}, {len(problem.names)} unknowns, {problem.predictor.steps} steps")
     step = replace(step_of(method), damped=True) if damped else method
-    mbe = estimate(problem, step, start=first, **limits)  # type: ignore[arg-type]
+    most = limits if few is None else limits | {"max_iterations": few}
+    mbe = estimate(problem, step, start=first, **most)  # type: ignore[arg-type]
     callback("posterior mode")
     mode = replace(step_of("be"), damped=damped)
     point = polish(problem, mbe, method=mode, **limits)  # type: ignore[arg-type]
