@@ -503,17 +503,33 @@ def _dumps(value: Any, known: Sequence[Any] = ()) -> bytes:
     """A pickle by value of what no module holds; known objects are referred to by number."""
     import cloudpickle
 
-    if not known:
-        return bytes(cloudpickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL))
     number = {id(one): k for k, one in enumerate(known)}
+    extremes = _extremes()
 
     class Pickler(cloudpickle.Pickler):  # type: ignore[misc]
         def persistent_id(self, one: Any) -> int | None:
             return number.get(id(one))
 
+        def reducer_override(self, one: Any) -> Any:
+            if isinstance(one, extremes):
+                return _as_it_was, (type(one), one.args)
+            return super().reducer_override(one)
+
     stream = io.BytesIO()
     Pickler(stream, protocol=pickle.HIGHEST_PROTOCOL).dump(value)
     return stream.getvalue()
+
+
+def _extremes() -> tuple[Any, ...]:
+    """SymPy's largest and smallest of several, if anything may hold one."""
+    module = sys.modules.get("sympy")
+    return () if module is None else (module.Max, module.Min)
+
+
+def _as_it_was(kind: Any, arguments: tuple[Any, ...]) -> Any:
+    """One of them again. To make it anew compares all arguments with each other, which takes as
+    long as to estimate a candidate."""
+    return kind(*arguments, evaluate=False)
 
 
 def _sent(value: Any, known: Sequence[Any] = ()) -> bytes:

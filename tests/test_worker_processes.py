@@ -255,3 +255,16 @@ def test_files_of_the_folder_are_not_run_and_odd_paths_do_no_harm(eager, tmp_pat
     processes._worker(0).ask(processes._dumps((None, None, None)))
     found = process_map(slow_square, {"unit": 1.0}, range(12), 2)
     assert len({number for number, _ in found}) == 2
+
+
+def test_the_largest_of_several_comes_back_as_it_was():
+    """Without comparing its arguments anew, nested ones included."""
+    import sympy as sp  # other processes load this file, and wait for what it loads
+
+    x, y, z = sp.symbols("x y z", real=True)
+    sent = sp.Max(x, y - 1, sp.Min(z, x * y, 3)) ** 2 + sp.Abs(x)
+    found = processes._loads(processes._dumps({"term": sent}))["term"]
+    assert found == sent
+    assert hash(found) == hash(sent)
+    assert sp.diff(found, x) == sp.diff(sent, x)
+    assert found.subs({x: 2, y: 5, z: 1}) == sent.subs({x: 2, y: 5, z: 1}) == 18

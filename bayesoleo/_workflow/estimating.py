@@ -28,7 +28,7 @@ from bayesoleo._workflow.output import (
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import Source, Task, prepare, silent
 from bayesoleo.discovery._assembly import Assembly
-from bayesoleo.discovery._fit import ModelFit, fit_model
+from bayesoleo.discovery._fit import ModelFit, fit_model, for_sampling
 from bayesoleo.discovery._inference import (
     CATALOGUE,
     Inference,
@@ -298,8 +298,9 @@ def draw(
         inference = inference_for(task, fit, task.assembly, callback)
     if inference.reason:
         callback(inference.reason)
-    density = inference.density(fit, settings.jobs)
-    of = [task.campaign.sha256, fit.model.digest(), fit.steps, settings.scheme]
+    sampled = for_sampling(fit)
+    density = inference.density(sampled, settings.jobs)
+    of = [task.campaign.sha256, fit.model.digest(), sampled.steps, settings.scheme]
     of += [] if settings.solver == COLLOCATION else [settings.solver]
     of += [] if inference.error_model == settings.error_model else [inference.error_model]
     samples = draw_from(

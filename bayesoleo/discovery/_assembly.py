@@ -277,11 +277,12 @@ class Assembly:
 
     def model(self) -> Model:
         """The driven model with everything in it."""
-        model = self.native if self.drive is None else driven_by(self.native, self.drive)
+        driven = self.native if self.drive is None else driven_by(self.native, self.drive)
+        model = driven
         for effect, target, scales in self.sensors:
             model = effect.extend(model, target, scales).model
         model = self.nuisance.extend(model)
-        model = with_estimated_starts(model) if self.starts else model
+        model = with_estimated_starts(model, driven) if self.starts else model
         return model.with_parameters(**self.parameters)
 
     def with_parameters(self, changed: Mapping[str, Parameter]) -> Assembly:

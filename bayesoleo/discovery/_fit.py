@@ -34,9 +34,11 @@ from bayesoleo.prediction._mesh_steps import (
     MOST_COMPARED,
     MOST_STEPS,
     WHOLE,
+    coarsest_steps,
     fineness,
     first_steps,
     steps_for,
+    whole_steps,
 )
 from bayesoleo.prediction._predictor import Predictor, RunPrediction
 from bayesoleo.prediction._records import Record
@@ -65,6 +67,18 @@ RESOLVED = 1e-3
 #: An estimate ends where the optimum is nearer than this many posterior standard deviations; its
 #: iterations gain a digit each, and what is below no figure shows.
 RESOLUTION = 1e-3
+#: The same of a model that is only compared with others. Twice its log likelihood is then short of
+#: the best by 0.01, or by one where iterations gain a tenth each: as much as the steps of its mesh
+#: may change. In effects of a measured pendulum half of all iterations gained less than that.
+COMPARED = 0.1
+#: Iterations of MBE on all steps after a mode on fewer, and of BE where that was not reached: MBE
+#: creeps where the data leave an unknown open.
+MORE = 10
+#: Starts of one estimate, each farther from the present one, that are worse than the best before
+#: the others are not looked at.
+GIVEN_UP = 2
+#: Part of the shift that the steps of an estimate may cause, for those of a density.
+SAMPLED = 0.1
 
 
 def weights(record: Record) -> Array:
@@ -328,6 +342,7 @@ def fit_model(
     start: Array | None = None,
     tolerance: float = 1e-6,
     max_iterations: int = 50,
+    resolution: float = RESOLUTION,
     share: Predictor | None = None,
     check_mesh: bool = True,
     damped: bool = False,
@@ -346,12 +361,14 @@ def fit_model(
         Scheme, steps, threads.
     start : ndarray, shape (l,) or (m, l), optional
         Where to start; by default at the nominal values, and from draws of the priors as well where
-        these lead to an estimate that the priors hardly allow. Of several starts the likeliest is
-        taken, solved from the last of them.
+        these lead to an estimate that the priors hardly allow. Of several starts, that lead from
+        far away to one whose motion is known, the likeliest is taken, solved from the last of them.
     tolerance : float
         Relative step at which the estimators stop.
     max_iterations : int
         Of each estimator.
+    resolution : float
+        Distance to the optimum, in posterior standard deviations, at which they stop as well.
     share : Predictor, optional
         Of the same runs; what does not depend on the model is taken from it.
     check_mesh : bool
@@ -374,15 +391,26 @@ def fit_model(
     ----------
     Verbeek (1993), eqs. 3.17, 3.19 and 3.23.
     """
-    callback, begun = progress or (lambda _: None), None
-    problem = _begun(model, records, numerics, share)
+    callback = progress or (lambda _: None)
+    begun = start if start is not None and start.ndim == 1 else None
+    limits = {
+        "tolerance": tolerance, "max_iterations": max_iterations, "resolution": resolution
+    }  # fmt: skip
+    problem, few = _begun(model, records, numerics, share), max_iterations
+    if check_mesh and start is not None and _has_fewer_steps(problem):
+        rough = _problem(model, records, numerics, _rough_steps(problem), share)
+        found = _look(rough, start, method, damped, limits, numerics.policy)
+        start = start if found is None else found.theta
+        few = few if found is None else min(max_iterations, MORE)
+        if found is not None and not found.status.ok:
+            limits["max_iterations"] = few
     while True:
         for run in problem.predictor.runs:
             # Nobody is told on which branch a model stands that is only compared with others, and
             # to follow a branch takes as long as to solve.
             run.watched = check_mesh
         mbe, point = _estimated(
-            problem, start, method, damped, tolerance, max_iterations, numerics.policy, callback
+            problem, start, method, damped, limits, numerics.policy, callback, few
         )
         problem.freeze(point.theta)
         predictions = problem.predictor.predict(problem.full(point.theta[None])[0])
@@ -402,8 +430,45 @@ def fit_model(
         # One-step collocation gains more than a factor of four by halving, so one look ahead
         # usually suffices.
         start = start if lost else point.theta
-        share = problem.predictor if _can_be_coarser(problem) else share
+        share = problem.predictor if _can_be_coarser(problem) or not check_mesh else share
+        before = problem.predictor
         problem = _problem(model, records, numerics, 2 * steps, share)
+        if not check_mesh:
+            _begin_with(problem.predictor, before)
+
+
+def _has_fewer_steps(problem: CampaignProblem) -> bool:
+    """Whether an estimate may begin on fewer steps than it needs to end. Those of records so long
+    that inputs choose their steps do so anyway."""
+    predictor, steps = problem.predictor, problem.predictor.steps
+    if not predictor.model.dofs or any(run.is_long for run in predictor.runs):
+        return False
+    periodic = [record.periodic for record in predictor.records]
+    if not any(periodic):
+        return True
+    return all(periodic) and predictor.solver == COLLOCATION and _rough_steps(problem) < steps
+
+
+def _rough_steps(problem: CampaignProblem) -> int:
+    """Steps for a first look."""
+    predictor = problem.predictor
+    return 2 * coarsest_steps(predictor.records, predictor.steps)
+
+
+def _look(
+    rough: CampaignProblem,
+    start: Array,
+    method: str,
+    damped: bool,
+    limits: dict[str, float],
+    policy: SearchPolicy,
+) -> PointEstimate | None:
+    """The mode from a start on fewer steps, from where it is near; None where it was lost. Most
+    iterations then take a part of their time."""
+    for run in rough.predictor.runs:
+        run.watched = False
+    _, point = _estimated(rough, start, method, damped, limits, policy, lambda _: None)
+    return point if point.status in (Status.CONVERGED, Status.NO_CONVERGENCE) else None
 
 
 def _estimated(
@@ -411,20 +476,19 @@ def _estimated(
     start: Array | None,
     method: str,
     damped: bool,
-    tolerance: float,
-    max_iterations: int,
+    limits: dict[str, float],
     policy: SearchPolicy,
     callback: Callable[[str], None],
+    few: int | None = None,
 ) -> tuple[PointEstimate, PointEstimate]:
-    """The estimate by a method and the mode, on one mesh; parameters as of :func:`fit_model`."""
-    limits = {
-        "tolerance": tolerance, "max_iterations": max_iterations, "resolution": RESOLUTION
-    }  # fmt: skip
+    """The estimate by a method, in a few iterations where it began with a mode, and the mode, on
+    one mesh; parameters as of :func:`fit_model`."""
     several = start is not None and start.ndim == 2
     first = _likeliest(problem, start) if start is not None and several else start
     callback(f"{method.upper()}, {len(problem.names)} unknowns, {problem.predictor.steps} steps")
     step = replace(step_of(method), damped=True) if damped else method
-    mbe = estimate(problem, step, start=first, **limits)  # type: ignore[arg-type]
+    most = limits if few is None else limits | {"max_iterations": few}
+    mbe = estimate(problem, step, start=first, **most)  # type: ignore[arg-type]
     callback("posterior mode")
     mode = replace(step_of("be"), damped=damped)
     point = polish(problem, mbe, method=mode, **limits)  # type: ignore[arg-type]
@@ -447,6 +511,11 @@ def _lost(mbe: PointEstimate, point: PointEstimate) -> bool:
 def _can_be_coarser(problem: CampaignProblem) -> bool:
     """Whether any run is so long that its steps may be joined."""
     return any(run.can_be_coarser for run in problem.predictor.runs)
+
+
+def _can_be_joined(problem: CampaignProblem) -> bool:
+    """Whether a comparison may do with fewer steps than were chosen for any run."""
+    return any(run.can_be_joined for run in problem.predictor.runs)
 
 
 def _error_of_mesh(
@@ -476,15 +545,17 @@ def _wants_finer(
 
     That of a model that stands for itself until it moves no more; of long transients also until no
     difference shows in what the model leaves (``seen``). Of a model that is only compared with
-    others this is all that is asked.
+    others this is all that is asked, and the steps that an integrator chose are fine enough.
     """
     steps, long = problem.predictor.steps, _can_be_coarser(problem)
-    if long and steps < WHOLE and lost:
+    whole = whole_steps(problem.predictor.model, problem.predictor.records)
+    fewer = steps < whole and (long or _can_be_joined(problem))
+    if fewer and lost and (long or point.status is not Status.NO_CONVERGENCE):
         return True  # steps may be so long that no solution is found, or lost on the way
     if not check:
         # Where iterations ended the estimate, finer steps than an integrator's give it only more.
-        most = MOST_COMPARED if point.status.ok else WHOLE
-        return long and steps < most and _shows(problem, point, predictions, numerics)
+        most = MOST_COMPARED if long and point.status.ok else whole
+        return (long or fewer) and steps < most and _shows(problem, point, predictions, numerics)
     if long and not np.isfinite(seen):
         moved = steps < WHOLE
     elif long and steps < MOST_COMPARED:
@@ -508,11 +579,11 @@ def for_comparison(fit: ModelFit) -> ModelFit:
     """A fit on the coarsest mesh that shows no difference, to score and refit candidates on.
 
     A comparison needs no higher accuracy than what it decides on. What a coarser mesh changes of
-    the outputs of long transients, and of the sum of squares through the residual, may not be more
-    than one variance of what the model leaves, over all samples together. That holds at this
-    estimate: an effect that explains ``a`` such variances and has the same error of the mesh
-    explains at most ``2 sqrt(a) + 1`` more or less there, which is little of what is far from a
-    limit.
+    the outputs, and of the sum of squares through the residual, may not be more than one variance
+    of what the model leaves, over all samples together. That holds at this estimate: an effect that
+    explains ``a`` such variances and has the same error of the mesh explains at most
+    ``2 sqrt(a) + 1`` more or less there, which is little of what is far from a limit. The estimate
+    of a candidate asks again, and is repeated on finer steps where these show.
 
     Parameters
     ----------
@@ -523,24 +594,71 @@ def for_comparison(fit: ModelFit) -> ModelFit:
     ModelFit
         The same estimate; itself where no run can be solved in fewer steps.
     """
-    if any(record.periodic for record in fit.records):
-        return fit
-    if not any(run.is_long for run in fit.predictor.runs):
-        return fit
     if not fit.model.dofs:  # what candidates begin with
-        return replace(fit, steps=min(fit.steps, COARSEST))
-    if not _can_be_coarser(fit.problem):
+        steps = min(fit.steps, coarsest_steps(fit.records, fit.steps))
+        long = fit.all_periodic or any(run.is_long for run in fit.predictor.runs)
+        return replace(fit, steps=steps) if long and _may_be_coarser(fit) else fit
+    return _on_fewest_steps(fit, lambda _, squares: squares <= fit.policy.unseen)
+
+
+def for_sampling(fit: ModelFit) -> ModelFit:
+    """A fit on the coarsest mesh that leaves the posterior where it is.
+
+    A density is computed some ten thousand times. Steps that move no parameter by a tenth of what
+    those of the estimate may, a hundredth of its standard deviation, move the posterior by less
+    than the draws of any sampler tell, and change the likelihood of the estimate by nothing that is
+    seen.
+
+    Parameters
+    ----------
+    fit : ModelFit
+
+    Returns
+    -------
+    ModelFit
+        The same estimate; itself where steps were asked for, or no run can be solved in fewer.
+    """
+    if fit.numerics.steps is not None or not fit.model.dofs:
         return fit
-    theta, steps = fit.point.theta, COARSEST
+    most, unseen = SAMPLED * fit.policy.mesh_shift, fit.policy.unseen
+    found = _on_fewest_steps(fit, lambda shift, squares: shift <= most and squares <= unseen)
+    found.problem.signatures = fit.problem.signatures
+    return found
+
+
+def _may_be_coarser(fit: ModelFit) -> bool:
+    """Whether there are meshes to compare: none where runs of both kinds share one, or a solver
+    chooses its own."""
+    periodic = [record.periodic for record in fit.records]
+    return not any(periodic) or (all(periodic) and fit.numerics.solver == COLLOCATION)
+
+
+def _on_fewest_steps(fit: ModelFit, do: Callable[[float, float], bool]) -> ModelFit:
+    """A fit on the fewest steps that do, by the shift of parameters and the change of the sum of
+    squares from those that it has; itself where none do."""
+    either = _can_be_coarser(fit.problem) or _can_be_joined(fit.problem)
+    if not (_may_be_coarser(fit) and either):
+        return fit
+    theta, known = fit.point.theta, [run.y for run in fit.predictions]
+    steps = coarsest_steps(fit.records, fit.steps)
     while steps < fit.steps:
         problem = _problem(fit.model, fit.records, fit.numerics, steps, fit.predictor)
+        _begin_with(problem.predictor, fit.predictor)
         if problem.freeze(theta) is Status.CONVERGED:
             found = problem.predictor.predict(problem.full(theta[None])[0])
-            known = [run.y for run in fit.predictions]
-            if _squares(problem, found, known, fit.point) <= fit.policy.unseen:
+            squares = _squares(problem, found, known, fit.point)
+            if do(_shift(problem, fit.point, found, known), squares):
                 return replace(fit, problem=problem, predictions=found, steps=steps)
         steps *= 2
     return fit
+
+
+def _begin_with(predictor: Predictor, known: Predictor) -> None:
+    """Start periodic runs from the motions of others of the same model, which are on their branch;
+    transients do so by themselves."""
+    for run, other in zip(predictor.runs, known.runs, strict=True):
+        if run.record.periodic:
+            run.motions, run.watched = other.known_motions(), other.watched
 
 
 def _shows(
@@ -567,16 +685,23 @@ def _squares(
     """Largest change of the sum of squares by better predictions, over the variances of what is
     left: ``d.d + |2 r.d|`` of their changes ``d`` and residuals ``r``."""
     squares, along = 0.0, 0.0
+    # An integrator's steps, and those of a period, are finer than what long ones are halved to.
+    settled = SETTLED if _can_be_coarser(problem) else 0.0
     for record, run, here, other in zip(
         problem.predictor.records, problem.predictor.runs, predictions, others, strict=True
     ):
-        own = changed_squares(run.measured, here.y, other, point.variance, weights(record))
+        own = changed_squares(run.measured, here.y, other, point.variance, weights(record), settled)
         squares, along = squares + own[0], along + own[1]
     return squares + abs(along)
 
 
 def changed_squares(
-    measured: Array, here: Array, other: Array, variance: Array, weight: Array
+    measured: Array,
+    here: Array,
+    other: Array,
+    variance: Array,
+    weight: Array,
+    settled: float = SETTLED,
 ) -> tuple[float, float]:
     """``d.d`` and ``2 r.d`` of a change ``d`` of outputs to residuals ``r``, over variances.
 
@@ -588,6 +713,8 @@ def changed_squares(
         Of what a model leaves.
     weight : ndarray, shape (N,)
         One for samples that count, zero for others.
+    settled : float
+        Root mean square of a change, over the size of an output, that is not seen.
     """
     counts = weight > 0
     if not counts.any():
@@ -595,12 +722,12 @@ def changed_squares(
     measured, here, other = (values[:, counts] for values in (measured, here, other))
     squares = np.mean((other - here) ** 2, axis=1)
     products = np.sum((measured - other) * (other - here), axis=1)
-    shown = products * _is_shown(measured, squares)
+    shown = products * _is_shown(measured, squares, settled)
     along = float(np.sum(2.0 * shown / np.maximum(variance, 1e-300)))
-    return visible(measured, squares, variance), along
+    return visible(measured, squares, variance, settled), along
 
 
-def visible(measured: Array, squares: Array, variance: Array) -> float:
+def visible(measured: Array, squares: Array, variance: Array, settled: float = SETTLED) -> float:
     """Sum of squares of a change of outputs, over the variances ``(ny,)`` of what a model leaves.
 
     Where it leaves next to nothing, what has settled shows no more.
@@ -611,24 +738,39 @@ def visible(measured: Array, squares: Array, variance: Array) -> float:
     squares : ndarray, shape (ny,)
         Mean squares of the change.
     variance : ndarray, shape (ny,)
+    settled : float
+        As of :func:`changed_squares`.
     """
-    shown = squares * _is_shown(measured, squares)
+    shown = squares * _is_shown(measured, squares, settled)
     return float(np.sum(shown / np.maximum(variance, 1e-300)) * measured.shape[1])
 
 
-def _is_shown(measured: Array, squares: Array) -> Array:
+def _is_shown(measured: Array, squares: Array, settled: float) -> Array:
     """One for outputs whose mean squared change ``(ny,)`` is more than what has settled, else
     zero."""
-    return (squares > SETTLED**2 * np.var(measured, axis=1)).astype(float)
+    return (squares > settled**2 * np.var(measured, axis=1)).astype(float)
 
 
 def _likeliest(problem: CampaignProblem, starts: Array) -> Array:
     """Of starts ``(m, l)`` the one that makes the data most likely; the first where that cannot be
-    told."""
+    told.
+
+    They lead from far away to the last, where the motion is known. Those beyond a few that are
+    worse than the best so far are not looked at: a motion far from what it is solved from takes ten
+    times as long, and the farther the less likely it is.
+    """
     if problem.freeze(starts[-1]) is not Status.CONVERGED:
         return cast(Array, starts[0])
-    cost = _cost(problem, starts)
-    return cast(Array, starts[int(np.argmin(cost)) if np.isfinite(cost).any() else 0])
+    best, least, worse = 0, np.inf, 0
+    for k in reversed(range(len(starts))):
+        (cost,) = _cost(problem, starts[k : k + 1])
+        if cost < least:
+            best, least, worse = k, float(cost), 0
+        else:
+            worse += int(np.isfinite(least))
+        if worse == GIVEN_UP:
+            break
+    return cast(Array, starts[best])
 
 
 def _cost(problem: CampaignProblem, vectors: Array) -> Array:
@@ -707,6 +849,7 @@ def _halved(problem: CampaignProblem, point: PointEstimate) -> list[Array] | Non
         jobs=coarse.jobs,
         share=coarse,
     )
+    _begin_with(fine, coarse)
     found = fine.solved_anew(theta)
     if any(samples.status[0] != Status.CONVERGED.value for samples in found):
         return None

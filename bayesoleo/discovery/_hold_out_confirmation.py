@@ -354,8 +354,11 @@ def confirmed(
     callback: ProgressCallback,
     *,
     on_trial: bool = False,
+    fitted: dict[int, State] | None = None,
 ) -> tuple[State | None, str]:
     """The state with an estimated effect, if the hold-out runs confirm it, and the reason.
+
+    The state is kept in ``fitted`` by the id of the result, whatever comes of it.
 
     In transients an effect may be added on trial where the fall exceeds fewer standard errors: it
     is judged in the final model (``_judged_together.py``).
@@ -376,6 +379,8 @@ def confirmed(
         return None, f"{item.effect} cannot be confirmed: {reason}"
     callback(f"confirm {item.effect} on hold-out runs")
     after = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
+    if fitted is not None:
+        fitted[id(result)] = after
     if not after.hold_errors.entries:
         return after, f"{_explains(item)}, {_on_fitted(result)}; no run was held out"
     fall = fall_on_hold_out(*judged(state, after), result.noise.on_trial)

@@ -452,11 +452,13 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
     """Continue a search until a round accepts no effect."""
     numerics, callback, max_effects = search.numerics, search.callback, search.max_effects
     roles, refused, together = _with_noise(search.roles, known), None, None
+    ahead: tuple[Round, Roles] | None = None
     while not known.finished:
         rounds, state, notes = known.rounds, known.state, list(known.notes)
         callback(f"round {len(rounds) + 1}: {_ratios(state)}")
         limit = JUDGED if state is together else _limit(state, len(rounds), max_effects)
-        outcome = examine(
+        outcome = None if limit else _looked_at(ahead, state, roles)
+        outcome = outcome or examine(
             state,
             roles,
             numerics,
@@ -467,6 +469,8 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
             keep_columns=search.keep_columns,
             callback=callback,
         )
+        ahead = None if outcome._ahead is None else (outcome._ahead, roles)
+        outcome = replace(outcome, _ahead=None)
         if rounds and rounds[-1].on_trial and _names_no_cause(outcome):
             callback("take back the last effect: no other one is confirmed with it")
             refused = rounds[-1].before
@@ -493,6 +497,15 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
         known = known.after(outcome, state, notes)
         search.keep(known)
     return known
+
+
+def _looked_at(ahead: tuple[Round, Roles] | None, state: State, roles: Roles) -> Round | None:
+    """A round that was looked at before, by roles with the same noise; None if it was another."""
+    if ahead is None:
+        return None
+    found, before = ahead
+    same = found.before is state and before.measured == roles.measured
+    return found if same and found.after is not None else None
 
 
 def _names_no_cause(outcome: Round) -> bool:

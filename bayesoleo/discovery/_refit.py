@@ -16,7 +16,7 @@ from scipy import stats
 from bayesoleo._types import Array
 from bayesoleo._worker_processes import process_map
 from bayesoleo.discovery._assembly import Assembly
-from bayesoleo.discovery._fit import ModelFit, Numerics, fit_model, weights
+from bayesoleo.discovery._fit import COMPARED, ModelFit, Numerics, fit_model, weights
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._score_basis import Base, squared_distance
 from bayesoleo.discovery._score_tests import Score, inflation_by_estimate
@@ -30,7 +30,7 @@ from bayesoleo.prediction._predictor import Layout, RunPrediction
 from bayesoleo.prediction._records import Record
 
 #: Parts of the values that a score expects, from which an estimate may start.
-STARTS = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 64, 1 / 256)
+STARTS = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 64, 1 / 256, 1 / 2**12, 1 / 2**16)
 
 
 @dataclass(frozen=True)
@@ -469,6 +469,7 @@ def quick_fit(
         else np.array([start_from(base.fit, one, model) for one in known]),
         tolerance=1e-4,
         max_iterations=15,
+        resolution=COMPARED,
         share=base.fit.predictor,
         check_mesh=False,
         damped=True,

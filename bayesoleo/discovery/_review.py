@@ -325,11 +325,14 @@ def _restarted(
     """A better estimate of one effect from other shapes, without its score; None where there is
     none. Its best known fall and inflation are given with it."""
     (base, numerics, best), (score, fall, inflation) = shared, item
-    better, grids = None, score.option.candidate.shapes
+    better, grids, tried = None, score.option.candidate.shapes, [dict(score.shapes)]
     for part in base.policy.shape_starts:
         if best - fall < base.policy.restart_gap * inflation:
             break
         shapes = {n: grid[int(part * (len(grid) - 1))] for n, grid in grids.items()}
+        if shapes in tried:  # of a scan of two values all parts are the first
+            continue
+        tried.append(shapes)
         again = refit(base, replace(score, shapes=shapes), numerics)
         if np.isfinite(again.share) and again.fall > fall:
             better, fall, inflation = again, again.fall, again.inflation

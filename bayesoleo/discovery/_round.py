@@ -69,6 +69,8 @@ class Round:
     on_trial: bool = False
     #: What the candidates change in the outputs, where it was kept.
     _scanned: Scanned | None = field(default=None, compare=False, repr=False)
+    #: The next round, where it was looked at before this one ended.
+    _ahead: Round | None = field(default=None, compare=False, repr=False)
 
 
 def examine(
@@ -129,24 +131,31 @@ def examine(
         return Round(state, ranking, failed, None, None, stop or limit, tests, _scanned=scanned)
     refits = _refit_best(base, ranking, tests, numerics, callback)
     ranking = rank(scores, tests, refits, base=base, policy=policy)
-    accepted, after, reason = _choose(state, base, ranking, refits, roles, numerics, callback)
-    pair = None
+    fitted: dict[int, State] = {}
+    accepted, after, reason = _choose(
+        state, base, ranking, refits, roles, numerics, callback, fitted
+    )
+    pair, looked = None, list[Round]()
     if ahead and accepted is not None and _explains_nothing(refits[id(accepted.score)]):
 
         def follow(one: State) -> tuple[Ranked | None, State | None]:
-            then = examine(one, roles, numerics, effects=effects, seed=seed, callback=callback)
-            return then.accepted, then.after
+            looked.append(
+                examine(one, roles, numerics, effects=effects, seed=seed, callback=callback)
+            )
+            return looked[-1].accepted, looked[-1].after
 
-        pair = confirmed_together(state, ranking, refits, roles, numerics, follow, callback)
+        pair = confirmed_together(state, ranking, refits, roles, numerics, follow, callback, fitted)
         accepted, after, reason = pair or (accepted, after, reason)
     if accepted is not None and after is not None and np.isnan(after.worst_ratio):
         reason = f"with {accepted.effect} a run has no solution at the estimate"
         accepted, after = None, None
     scanned = scanned if after is None else None  # of a model that is final
     trial = pair is not None and after is not None
+    then = next((one for one in looked if one.before is after), None)
     return Round(
-        state, ranking, failed, accepted, after, reason, tests, on_trial=trial, _scanned=scanned
-    )
+        state, ranking, failed, accepted, after, reason, tests,
+        on_trial=trial, _scanned=scanned, _ahead=then,
+    )  # fmt: skip
 
 
 def _explains_nothing(result: Refit) -> bool:
@@ -272,8 +281,9 @@ def _choose(
     roles: Roles,
     numerics: Numerics,
     callback: ProgressCallback,
+    fitted: dict[int, State] | None = None,
 ) -> tuple[Ranked | None, State | None, str]:
-    """The best effect that the hold-out runs confirm.
+    """The best effect that the hold-out runs confirm; ``fitted`` keeps what was fitted for that.
 
     Among effects that leave only noise on the fitted runs and have nearly the same penalised sum
     of squares there, the first that also leaves only noise on the hold-out runs is chosen.
@@ -293,7 +303,9 @@ def _choose(
         result = refits[id(item.score)]
         if found is not None and not _as_good(base, result, refits[id(found[0].score)]):
             continue
-        after, reason = confirmed(state, item, result, roles, numerics, callback, on_trial=True)
+        after, reason = confirmed(
+            state, item, result, roles, numerics, callback, on_trial=True, fitted=fitted
+        )
         if after is None:
             reasons.append(reason)
         elif after.at_floor or not result.reached:

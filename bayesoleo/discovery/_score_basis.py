@@ -27,7 +27,7 @@ from bayesoleo.discovery._spectral_data import SpectralData
 from bayesoleo.estimation._least_squares import PriorScale
 from bayesoleo.estimation._problem import measured_of
 from bayesoleo.model._model import Model
-from bayesoleo.prediction._mesh_steps import WHOLE
+from bayesoleo.prediction._mesh_steps import whole_steps
 from bayesoleo.prediction._periodic_run import FEW_STEPS, PredictedSamples, RunPredictor
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
@@ -227,7 +227,8 @@ def sensitivities_of(
         derivatives = _of_run(fit, r, run, p)
         if isinstance(derivatives, Status):
             # Steps that do for the present model may be too long for what an effect adds.
-            coarse = fit.steps < WHOLE and run.can_be_coarser
+            fewer = fit.steps < whole_steps(model, fit.records)
+            coarse = fewer and (run.can_be_coarser or run.can_be_joined)
             finer = replace(fit, steps=2 * fit.steps)
             return sensitivities_of(finer, model, shapes) if coarse else derivatives
         for k, y_p in enumerate(derivatives):

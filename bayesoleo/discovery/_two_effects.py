@@ -11,6 +11,7 @@ next round must confirm another one, or it is taken back.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 from scipy import stats
@@ -40,6 +41,7 @@ def confirmed_together(
     numerics: Numerics,
     follow: Callable[[State], tuple[Ranked | None, State | None]],
     callback: ProgressCallback,
+    fitted: Mapping[int, State] = MappingProxyType({}),
 ) -> tuple[Ranked, State, str] | None:
     """An effect that with the one found after it lowers the error on hold-out runs.
 
@@ -57,6 +59,8 @@ def confirmed_together(
         Of a model: the effect that the next round adds to it, and the model with both.
     callback : callable
         Receives a message at each step.
+    fitted : mapping of int to State
+        Models with some of the effects on all runs, by the id of their estimates.
 
     Returns
     -------
@@ -75,7 +79,9 @@ def confirmed_together(
         if lacks_input(result, roles) is not None:
             continue
         callback(f"follow {item.effect} one round further")
-        one = fit_state(result.assembly, roles, numerics, start=result.fit.point.theta)
+        one = fitted.get(id(result)) or fit_state(
+            result.assembly, roles, numerics, start=result.fit.point.theta
+        )
         if np.isnan(one.worst_ratio):
             continue
         other, both = follow(one)

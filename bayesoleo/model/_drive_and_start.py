@@ -330,8 +330,16 @@ def start_parameters(model: Model) -> frozenset[str]:
     return frozenset(alone - {item.name for e in rest for item in e.free_symbols})
 
 
-def with_estimated_starts(model: Model) -> Model:
+def with_estimated_starts(model: Model, shown: Model | None = None) -> Model:
     """Give every dof whose start is not declared one that is estimated, run by run.
+
+    Parameters
+    ----------
+    model : Model
+    shown : Model, optional
+        By whose outputs the probable start of its own dofs is found; by default the model's. An
+        error of a sensor that an effect adds leaves a measured start nearly where it was: at rest,
+        estimates of that effect would begin far from the motion.
 
     Returns
     -------
@@ -341,7 +349,11 @@ def with_estimated_starts(model: Model) -> Model:
         equation holds has no choice: it starts in equilibrium.
     """
     for name in undeclared_starts(model):
-        centre, dof = centre_of(model, name), model.dofs[name]
+        known = shown is not None and name in shown.dofs
+        centre, dof = (
+            centre_of(shown if shown is not None and known else model, name),
+            model.dofs[name],
+        )
         if not _has_rate(model, name):
             model = replace(model, dofs={**model.dofs, name: replace(dof, initial=EQUILIBRIUM)})
             continue

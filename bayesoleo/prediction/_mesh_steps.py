@@ -41,6 +41,22 @@ def first_steps(model: Model, records: Sequence[Record]) -> int:
     return int(min(MOST_STEPS, 2 ** int(np.ceil(np.log2(wanted)))))
 
 
+def whole_steps(model: Model, records: Sequence[Record]) -> int:
+    """Steps that an estimate begins with: fewer only do for comparisons, or for a first look."""
+    return first_steps(model, records) if any(r.periodic for r in records) else WHOLE
+
+
+def coarsest_steps(records: Sequence[Record], steps: int) -> int:
+    """The fewest steps for a comparison of models that were estimated on so many.
+
+    A period has the fewest that any has, and an eighth of its own, where a step sees two radians of
+    the highest harmonic at six points.
+    """
+    if not any(record.periodic for record in records):
+        return COARSEST
+    return min(steps, max(FEWEST_STEPS, steps // 8))
+
+
 def fineness(model: Model, records: Sequence[Record], steps: int) -> int:
     """How finely transients are cut beside periodic runs of so many steps.
 

@@ -197,6 +197,11 @@ class RunPredictor:
         """Whether fewer steps than an integrator's may do; of a periodic run nobody chose any."""
         return False
 
+    @property
+    def can_be_joined(self) -> bool:
+        """Whether a comparison may do with fewer steps than were chosen."""
+        return bool(self.kernels.derived.dofs)
+
     def base_constants(self) -> Array:
         """Nominal parameters and this run's conditions, shape (np,)."""
         values = []

@@ -26,7 +26,7 @@ from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._starts import Anchor, InitialState, Motion
 from bayesoleo.solvers._collocation import Collocation
 from bayesoleo.solvers._initial_value import Dynamics
-from bayesoleo.solvers._mesh import Mesh, equidistant, halved, resolving, tableau
+from bayesoleo.solvers._mesh import Mesh, equidistant, halved, joined, resolving, tableau
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import Boundary, Solution
 from bayesoleo.solvers._schemes import DEFAULT_SCHEME
@@ -50,6 +50,9 @@ SETTLED, MOST_STEPS = 3e-5, 400_000
 MOST_BYTES, ARRAYS = 1e9, 8
 #: Steps of equal length where equations have no explicit form for an integrator to choose by.
 FALLBACK = 512
+#: Steps of an integrator from which on it is worth the time to find out whether fewer would do: to
+#: solve so many takes about as long as what Python does around it.
+WORTH_JOINING = 512
 
 
 class TransientRun(RunPredictor):
@@ -68,8 +71,8 @@ class TransientRun(RunPredictor):
         A transient run.
     steps : int
         Fineness: :data:`WHOLE` is the integrator's own mesh; twice as much halves its steps. Half
-        as much doubles those of a record so long that its inputs choose them; how fine it must be
-        is then for whoever asks to find out, as for a periodic run.
+        as much doubles them where they are many; how fine they must be is then for whoever asks to
+        find out, as for a periodic run.
     scheme_name : str
         Discretisation by collocation; the thesis's differences have no counterpart here, and the
         default stands in for them.
@@ -141,9 +144,12 @@ class TransientRun(RunPredictor):
 
     def _adopt(self, mesh: Mesh) -> None:
         """Work on a mesh, cut as fine as asked for, or as coarse."""
-        fine = halved(mesh, max(round(np.log2(self.fineness / WHOLE)), 0))
-        if self.fineness < WHOLE and follows_inputs(mesh):
+        times = round(np.log2(self.fineness / WHOLE))
+        fine = halved(mesh, max(times, 0))
+        if times < 0 and follows_inputs(mesh):
             fine = equidistant(int(np.ceil(mesh.steps * self.fineness / WHOLE)))
+        elif times < 0 and mesh.steps >= WORTH_JOINING:
+            fine = joined(mesh, -times)
         derived = self.kernels.derived
         self.collocation = Collocation(self.method, derived.orders, fine)
         self.steps, self.scheme = fine.steps, self.collocation
@@ -196,6 +202,13 @@ class TransientRun(RunPredictor):
         if not self.kernels.derived.dofs:
             return False
         return self.is_long if self.chosen is None else follows_inputs(self.chosen)
+
+    @property
+    def can_be_joined(self) -> bool:
+        """Whether its steps are an integrator's, and so many that joining them is worth a look."""
+        if not self.kernels.derived.dofs or self.chosen is None:
+            return False
+        return self.chosen.steps >= WORTH_JOINING and not follows_inputs(self.chosen)
 
     @property
     def is_long(self) -> bool:

@@ -208,7 +208,7 @@ def equidistant(n: int) -> Mesh:
 
 
 def graded(mesh: Mesh, ratio: float = GRADING) -> Mesh:
-    """Cut steps until neighbours differ by a factor at most.
+    """Cut steps until neighbours differ by a factor, or by thrice that where pieces meet.
 
     Parameters
     ----------
@@ -217,23 +217,24 @@ def graded(mesh: Mesh, ratio: float = GRADING) -> Mesh:
         The factor, above one.
     """
     lengths = np.diff(mesh.edges)
-    allowed = lengths.copy()
-    # A step may be longer than its neighbour by what one cut of that factor leaves.
+    # How long pieces have become at the end of each step from those on its left, and may be at its
+    # beginning to shrink to those on its right.
+    left, right = lengths.copy(), lengths.copy()
     for n in range(1, lengths.size):
-        allowed[n] = min(allowed[n], ratio * allowed[n - 1])
+        left[n] = min(left[n], ratio * left[n - 1] + (ratio - 1) * lengths[n])
     for n in range(lengths.size - 2, -1, -1):
-        allowed[n] = min(allowed[n], ratio * allowed[n + 1])
+        right[n] = min(right[n], ratio * right[n + 1] + (ratio - 1) * lengths[n])
     edges = [0.0]
     for n, length in enumerate(lengths):
-        edges += _cut(mesh.edges[n], length, allowed, n, ratio)
+        before = left[n - 1] if n > 0 else length
+        after = right[n + 1] if n + 1 < lengths.size else length
+        edges += _cut(mesh.edges[n], length, before, after, ratio)
     edges[-1] = 1.0
     return Mesh(np.array(edges))
 
 
-def _cut(left: float, length: float, allowed: Array, n: int, ratio: float) -> list[float]:
+def _cut(left: float, length: float, before: float, after: float, ratio: float) -> list[float]:
     """Right edges of the pieces of one step, that grow from both of its neighbours."""
-    before = allowed[n - 1] if n > 0 else length
-    after = allowed[n + 1] if n + 1 < allowed.size else length
     first, last = min(length, ratio * before), min(length, ratio * after)
     if length <= min(first, last) * (1 + 1e-12):
         return [left + length]
@@ -256,6 +257,14 @@ def halved(mesh: Mesh, times: int = 1) -> Mesh:
     for _ in range(times):
         middle = 0.5 * (edges[:-1] + edges[1:])
         edges = np.sort(np.concatenate([edges, middle]))
+    return Mesh(edges)
+
+
+def joined(mesh: Mesh, times: int = 1) -> Mesh:
+    """Join every two neighbouring steps, so many times; the last is alone where they are odd."""
+    edges = mesh.edges
+    for _ in range(times):
+        edges = np.append(edges[:-1:2], 1.0)
     return Mesh(edges)
 
 

@@ -45,7 +45,7 @@ def test_the_one_that_predicts_the_runs_held_out(monkeypatch, worths, at_floor, 
     ]
     refits = {id(result.score): result for result in results.values()}
 
-    def confirmed(_, item, *__, on_trial):
+    def confirmed(_, item, *__, on_trial, **___):
         assert on_trial
         after = SimpleNamespace(at_floor=at_floor[item.effect]) if item.effect in at_floor else None
         return after, item.effect

@@ -323,3 +323,28 @@ def test_the_next_rival_is_asked_where_runs_speak_against_the_best(monkeypatch):
     monkeypatch.setattr(review, "_replaced", replaced)
     assert review.reviewed(found, None, None, None, lambda _: None) is found
     assert asked == ["drag", "friction"]
+
+
+@pytest.mark.parametrize(
+    ("grid", "first", "expected"),
+    [
+        ((1.0, 2.0), 1.0, []),
+        ((1.0, 2.0), 2.0, [1.0]),
+        ((1.0, 2.0, 3.0, 4.0, 5.0), 3.0, [2.0, 4.0]),
+    ],
+)
+def test_an_estimate_is_repeated_from_each_other_shape_once(monkeypatch, grid, first, expected):
+    """Of a scan of few values several parts are the same one."""
+    tried = []
+
+    def refit(_, score, __):
+        tried.append(score.shapes["r"])
+        return SimpleNamespace(share=-np.inf)
+
+    monkeypatch.setattr(review, "refit", refit)
+    monkeypatch.setattr(review, "replace", lambda _, *, shapes: SimpleNamespace(shapes=shapes))
+    candidate = SimpleNamespace(shapes={"r": grid})
+    score = SimpleNamespace(shapes={"r": first}, option=SimpleNamespace(candidate=candidate))
+    base = SimpleNamespace(policy=SearchPolicy())
+    assert review._restarted((base, None, 100.0), (score, 0.0, 1.0)) is None
+    assert tried == expected

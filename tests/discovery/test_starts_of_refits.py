@@ -7,16 +7,17 @@ import pytest
 from fitted_states import NUMERICS
 from scipy.integrate import solve_ivp
 
-import bayesoleo.discovery._refit as refits
+from bayesoleo.discovery import _fit as fits, _refit as refits
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._fit import _likeliest
+from bayesoleo.discovery._fit import _likeliest, _problem
 from bayesoleo.discovery._ranking import score_candidates
-from bayesoleo.discovery._refit import STARTS, refit
+from bayesoleo.discovery._refit import STARTS, refit, start_from
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.effects import find_effect
 from bayesoleo.model import Dof, Model, Output, Parameter
+from bayesoleo.prediction._mesh_steps import WHOLE
 from bayesoleo.prediction._records import transient_record
 
 STEP, COUNT, SWINGS = 0.02, 3001, 2 * np.pi
@@ -95,6 +96,42 @@ def test_the_likeliest_start_is_taken(scored: tuple[Base, Score]) -> None:
     best = scored[0].fit.point.theta
     starts = np.array([1.3 * best, best, 1.01 * best])
     assert np.array_equal(_likeliest(problem, starts), best)
+
+
+def test_starts_beyond_some_that_are_worse_are_not_looked_at(
+    scored: tuple[Base, Score], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = scored[0].fit.problem
+    best = scored[0].fit.point.theta
+    asked: list[float] = []
+    cost = fits._cost
+
+    def counted(problem, vectors):
+        asked.extend(vectors[:, 0] / best[0])
+        return cost(problem, vectors)
+
+    monkeypatch.setattr(fits, "_cost", counted)
+    starts = np.outer([3.0, 1.3, 1.2, 1.1, 1.0, 1.01], best)
+    assert np.array_equal(_likeliest(problem, starts), best)
+    assert asked == pytest.approx([1.01, 1.0, 1.1, 1.2])
+
+
+@pytest.mark.parametrize("effect", ["sensor_offset", "sensor_offset_by_run", "sensor_lag"])
+def test_a_free_motion_starts_where_it_was_whatever_its_sensor_does(
+    scored: tuple[Base, Score], effect: str
+) -> None:
+    """The null of an effect on a sensor is the present model, its start included."""
+    base = scored[0]
+    step = scored[1].option.assembly.steps[-1]
+    assembly = scored[1].option.assembly.without(step)
+    (option,) = assembly.options(step.scales, (find_effect(effect),))
+    problem = _problem(option.model, base.fit.records, NUMERICS, WHOLE, base.fit.predictor)
+    start = start_from(base.fit, base.fit.values, option.model)
+    assert problem.freeze(start).ok
+    (other,) = fits._cost(problem, start[None])
+    (own,) = fits._cost(base.fit.problem, base.fit.point.theta[None])
+    # Meshes of both may change this by one each; from rest it is some ten thousand more.
+    assert other == pytest.approx(own, abs=2.0)
 
 
 def test_the_first_start_is_taken_where_the_last_cannot_be_solved(

@@ -31,8 +31,9 @@ def ranked(
     return item, result
 
 
-def looked(monkeypatch, items, then, falls, held=(1,)):
-    """What is found where each effect is followed by another one with a fall of both."""
+def looked(monkeypatch, items, then, falls, held=(1,), known=()):
+    """What is found where each effect is followed by another one with a fall of both; models with
+    some effects may be known."""
     refits = {id(item.score): result for item, result in items}
     followed = []
 
@@ -71,6 +72,7 @@ def looked(monkeypatch, items, then, falls, held=(1,)):
         numerics,
         follow,
         str,
+        {id(result): one for result, one in known},
     )
     return found, followed
 
@@ -92,6 +94,27 @@ def test_the_pair_that_predicts_best_is_begun(monkeypatch):
     item, state, reason = found
     assert (item.effect, state.name) == ("friction", "friction")
     assert "with drag lowers the error on hold-out runs" in reason
+
+
+def test_a_model_that_was_fitted_to_be_confirmed_is_not_fitted_again(monkeypatch):
+    items = [ranked("friction"), ranked("drag")]
+    known = SimpleNamespace(name="known", worst_ratio=2.0)
+    then, falls = {"known": "drag"}, {"known": 90.0}
+    found, followed = looked(monkeypatch, items, then, falls, known=[(items[0][1], known)])
+    assert followed == ["known", "drag"]
+    assert found[1] is known
+
+
+def test_a_round_that_was_looked_at_ahead_is_not_searched_again(monkeypatch):
+    """Unless it is another model, or its noise is another."""
+    before, other = SimpleNamespace(), SimpleNamespace()
+    noise = {("1", "y"): 1.0}
+    ahead = Round(before, (), {}, None, SimpleNamespace(), "", 1.0), SimpleNamespace(measured=noise)
+    same, changed = SimpleNamespace(measured=dict(noise)), SimpleNamespace(measured={})
+    assert loop._looked_at(ahead, before, same) is ahead[0]
+    assert loop._looked_at(ahead, other, same) is None
+    assert loop._looked_at(ahead, before, changed) is None
+    assert loop._looked_at(None, before, same) is None
 
 
 @pytest.mark.parametrize(

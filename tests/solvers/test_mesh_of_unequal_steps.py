@@ -6,7 +6,7 @@ from periodic_problems import coupled, duffing, harmonics, problem, relaxation, 
 from scipy.integrate import solve_ivp
 
 from bayesoleo.errors import InputError
-from bayesoleo.solvers._mesh import Mesh, equidistant
+from bayesoleo.solvers._mesh import Mesh, equidistant, graded, halved, joined
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import sensitivities, solve_periodic
 from bayesoleo.solvers._schemes import scheme
@@ -151,3 +151,29 @@ def test_what_cannot_use_a_mesh_says_so():
         scheme("thesis", (2,), equidistant(8))
     with pytest.raises(InputError, match="the mesh has 8"):
         scheme("radau3", (2,), equidistant(8)).phases(16)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7, 64])
+@pytest.mark.parametrize("times", [1, 2])
+def test_joined_steps_end_where_some_of_the_others_did(steps, times):
+    rng = np.random.default_rng(steps)
+    edges = np.concatenate([[0.0], np.sort(rng.uniform(0.01, 0.99, steps - 1)), [1.0]])
+    found = joined(Mesh(edges), times)
+    assert found.steps == int(np.ceil(steps / 2**times))
+    assert set(found.edges) <= set(edges)
+    np.testing.assert_array_equal(joined(halved(Mesh(edges), times), times).edges, edges)
+
+
+@pytest.mark.parametrize("ratio", [1.5, 2.0, 3.0])
+def test_neighbouring_steps_of_a_graded_mesh_are_alike(ratio):
+    """A kink in the middle of long steps: from there they grow by the ratio at most."""
+    edges = np.concatenate([np.linspace(0.0, 0.5, 9), 0.5 + 1e-6 * np.arange(1, 4), [0.6, 1.0]])
+    found = graded(Mesh(edges), ratio)
+    assert set(edges) <= set(found.edges)
+    lengths = np.diff(found.edges)
+    grown = lengths[1:] / lengths[:-1]
+    # Where pieces from both sides meet, one may be what is left.
+    assert np.maximum(grown, 1.0 / grown).max() < 3.0 * ratio
+    # On either side of the kink steps of one length grow to the next, and no others are cut.
+    growing = int(np.ceil(np.log(0.1 / 1e-6) / np.log(ratio)))
+    assert found.steps < 2 * growing + 2 * edges.size
