@@ -1,7 +1,8 @@
 """What all candidates change in the outputs at one estimate, kept from a score for what follows it.
 
 The choice of an error model needs the same sensitivities as the last scores of a search: at the
-same estimate, steps, samples and shapes. They are handed on rather than computed again.
+same estimate, samples and shapes, on steps that show no difference. They are handed on rather than
+computed again.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ Columns = list[Block] | Status
 
 
 class Scanned:
-    """Columns of all candidates beside one fitted model; they are handed on once, and not pickled.
+    """Columns of all candidates beside one estimate; they are handed on once, and not pickled.
 
     Parameters
     ----------
     fit : ModelFit
-        At whose estimate and steps they were computed.
+        At whose estimate they were computed.
     assembly : Assembly
         What was fitted.
     effects : sequence of Effect or None
@@ -47,16 +48,16 @@ class Scanned:
         options: Sequence[Option],
         columns: Sequence[Columns],
     ):
-        self._of = fit, assembly, effects
+        self._of = fit.point, assembly, effects
         self._found: tuple[Sequence[Option], Sequence[Columns]] | None = options, columns
 
     def take(
         self, fit: ModelFit, assembly: Assembly, effects: Sequence[Effect] | None
     ) -> tuple[Sequence[Option], Sequence[Columns]] | None:
-        """Options and their columns; None where they are of another fit, or were taken before."""
+        """Options and their columns; None where another estimate's, or taken before."""
         found, self._found = self._found, None
-        same_fit, same_assembly, same_effects = self._of
-        same = same_fit is fit and same_assembly is assembly
+        same_point, same_assembly, same_effects = self._of
+        same = same_point is fit.point and same_assembly is assembly
         if found is None or not same or not _equal(same_effects, effects):
             return None
         return found

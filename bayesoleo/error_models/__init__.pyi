@@ -44,3 +44,6 @@ from ._signatures import (
 from ._spectral import (
     SpectralErrors as SpectralErrors,
 )
+from ._stretch import (
+    Stretch as Stretch,
+)

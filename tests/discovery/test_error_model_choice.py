@@ -161,10 +161,11 @@ def test_what_a_score_computed_is_not_computed_again(left, monkeypatch):
         np.testing.assert_array_equal(one, other)
 
 
-def test_columns_of_another_fit_are_not_taken(left):
+def test_columns_of_another_estimate_are_not_taken(left):
     """Nor those of other effects; and they are handed on once, and never pickled."""
     fit, assembly = left.fit, left.assembly
-    assert scanned_by(left).take(replace(fit), assembly, EFFECTS) is None
+    other = replace(fit, point=replace(fit.point))
+    assert scanned_by(left).take(other, assembly, EFFECTS) is None
     assert scanned_by(left).take(fit, replace(assembly), EFFECTS) is None
     assert scanned_by(left).take(fit, assembly, EFFECTS[:1]) is None
     scanned = scanned_by(left)
