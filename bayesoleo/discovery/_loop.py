@@ -369,8 +369,8 @@ def close_loop(
     try:
         structures = probabilities(known, numerics, prior, callback)
     except (np.linalg.LinAlgError, ArithmeticError, ValueError) as error:
-        known = isinstance(error, np.linalg.LinAlgError | ArithmeticError)
-        if not known and NOT_FINITE not in str(error):
+        numerical = isinstance(error, np.linalg.LinAlgError | ArithmeticError)
+        if not numerical and NOT_FINITE not in str(error):
             raise
         # What was found stands without them.
         return replace(loop, notes=(*loop.notes, f"{NO_PROBABILITIES}: {error}"))
