@@ -202,6 +202,11 @@ def compared_without(
     """The loss without one effect of a model, and the fit of all other unknowns."""
     without = state.assembly.without(step).model()
     fit = quick_fit(base, without, base.fit.values, numerics)
+    return loss_of(base, step, fit), fit
+
+
+def loss_of(base: Base, step: AddedEffect, fit: ModelFit) -> Loss:
+    """The loss of a model's fit without an effect, or also without others."""
     share, changes = compare(base, fit)
     names = [n for n in base.fit.problem.names if n not in fit.problem.names]
     measured = inflation_along(base, base.fit, names, changes)
@@ -209,7 +214,7 @@ def compared_without(
     noise = Inflation(found.value * spread, found.freedom, found.on_trial * spread)
     # The logarithm is that of the effective number of independent samples.
     price = max(schwarz_price(base) - float(np.log(noise.on_trial)), 1.0)
-    return Loss(step, -share * base.fall_back, len(names), price, noise), fit
+    return Loss(step, -share * base.fall_back, len(names), price, noise)
 
 
 def dispersion(base: Base) -> float:

@@ -6,19 +6,21 @@ therefore added on trial first. When no further one is found, each is judged in 
 which leaves least: without it, all else estimated anew, the hold-out error must be significantly
 higher. Where no hold-out run is declared, or none shows the effect, the error on the fitted runs
 must be, after the correction for the search. The effect that misses this most is removed, and the
-others are judged again. A smooth function that stands for no name is not judged here.
+others are judged again. What is removed leaves more, beside which the next one is hardly seen: so
+all that were removed are judged with it too, in the model that had them. Where they are confirmed
+together, it stays. A smooth function that stands for no name is not judged here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
 
 from bayesoleo._types import ProgressCallback
-from bayesoleo.discovery._alternatives import Loss, compared_without
+from bayesoleo.discovery._alternatives import Loss, compared_without, loss_of
 from bayesoleo.discovery._assembly import AddedEffect, Roles
 from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._hold_out_confirmation import Fall, fall_on_hold_out, judged
@@ -47,6 +49,8 @@ class Evidence:
     declared : bool
         Whether hold-out runs are declared, so that none of them was fitted.
     policy : SearchPolicy
+    others : bool
+        Whether it is for the effect together with those that were removed before.
     """
 
     loss: Loss
@@ -54,6 +58,7 @@ class Evidence:
     tests: float
     declared: bool
     policy: SearchPolicy = SearchPolicy()
+    others: bool = False
 
     @property
     def is_known(self) -> bool:
@@ -89,9 +94,11 @@ class Evidence:
         return max(short, 1e-9)  # what is too small to confirm anything misses it too
 
     def __str__(self) -> str:
+        more = " and those removed before it" if self.others else ""
         if self.by_others is None:
-            return str(self.loss)
-        return f"without it the weighted squared error on hold-out runs rises by {self.by_others}"
+            return f"{self.loss}{more and f', without it{more}'}"
+        error = "the weighted squared error on hold-out runs"
+        return f"without it{more} {error} rises by {self.by_others}"
 
 
 def judged_together(
@@ -120,25 +127,70 @@ def judged_together(
     if state.fit.all_periodic:
         return state
     notes[:] = [note for note in notes if not note.startswith(TOGETHER)]
+    whole: _Whole | None = None
     while chosen := [step for step in state.assembly.steps if step.effect.family != FAMILY]:
         callback("judge the effects beside each other")
         base = state.base()
         found = _evidence(state, base, chosen, roles, numerics, tests)
-        worst = max(found, key=lambda one: one.missing, default=None)
-        if worst is None or not worst.missing > 0.0:
+        less = _without_one(state, base, found, whole, roles, numerics, notes, callback)
+        if less is None:
             parts = [f"{one.loss.step.effect.id}: {one}" for one in found]
             notes += [f"{TOGETHER}; {'; '.join(parts)}"] if parts else []
             return state
-        effect = worst.loss.step.effect.id
-        callback(f"remove {effect}: {worst}")
-        notes.append(
-            f"{effect} was removed again: beside the other effects of the final model it is not"
-            f" confirmed, since {worst}"
-        )
-        assembly = state.assembly.without(worst.loss.step)
-        start = start_from(base.fit, base.fit.values, assembly.model())
-        state = fit_state(assembly, roles, numerics, start=start, progress=callback)
+        whole = whole or _Whole(state, base)
+        state = less
     return state
+
+
+@dataclass(frozen=True)
+class _Whole:
+    """A model before any of its effects is removed, which leaves least."""
+
+    state: State
+    base: Base
+
+    def evidence(self, alone: Evidence, after: State) -> Evidence:
+        """What the data say for an effect and all that a model lacks besides, as they do for one
+        alone."""
+        loss, fall = loss_of(self.base, alone.loss.step, after.fit), None
+        if self.state.hold_errors.entries and np.isfinite(loss.rise):
+            fall = fall_on_hold_out(*judged(after, self.state), loss.noise.on_trial)
+        return replace(alone, loss=loss, fall=fall, others=True)
+
+
+def _without_one(
+    state: State,
+    base: Base,
+    found: list[Evidence],
+    whole: _Whole | None,
+    roles: Roles,
+    numerics: Numerics,
+    notes: list[str],
+    callback: ProgressCallback,
+) -> State | None:
+    """The state without the effect that misses most what keeps it; None where each is kept.
+
+    What is said for an effect that is kept only together with those that were removed before
+    takes the place of what was found for it alone.
+    """
+    for one in sorted(found, key=lambda item: -item.missing):
+        if not one.missing > 0.0:
+            break
+        effect, step = one.loss.step.effect.id, one.loss.step
+        callback(f"remove {effect}: {one}")
+        assembly = state.assembly.without(step)
+        start = start_from(base.fit, base.fit.values, assembly.model())
+        less = fit_state(assembly, roles, numerics, start=start, progress=callback)
+        joint = None if whole is None else whole.evidence(one, less)
+        if joint is None or not joint.is_known or joint.missing > 0.0:
+            notes.append(
+                f"{effect} was removed again: beside the other effects of the final model it is not"
+                f" confirmed, since {one}"
+            )
+            return less
+        callback(f"keep {effect}: {joint}")
+        found[found.index(one)] = joint
+    return None
 
 
 def _evidence(

@@ -11,6 +11,7 @@ from fitted_states import NUMERICS, options
 from scipy import stats
 from small_campaigns import FRICTION, _coloured, damper, damper_campaign
 
+from bayesoleo.discovery import _judged_together as judging
 from bayesoleo.discovery._alternatives import Loss, likelihood_gap, plainly_needed
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._hold_out_confirmation import Fall, fall_error
@@ -135,6 +136,62 @@ def test_a_friction_stays_and_what_slow_noise_feigned_goes(tmp_path):
     again = [f"{TOGETHER}; preload: as before", removed]
     assert judged_together(found, roles, NUMERICS, 12.0, again, lambda _: None) is found
     assert again == [removed, kept], "what was confirmed beside another model is not said of this"
+
+
+class Effects:
+    """A model with some effects, as far as their removal asks for it."""
+
+    def __init__(self, *names):
+        self.added, self.steps = names, [step(name) for name in names]
+        self.assembly, self.fit = self, SimpleNamespace(all_periodic=False, values={})
+        self.hold_errors = SimpleNamespace(entries=[])
+
+    def without(self, one):
+        return Effects(*(name for name in self.added if name != one.effect.id))
+
+    def base(self):
+        return SimpleNamespace(fit=self.fit)
+
+    def model(self):
+        return None
+
+
+def step(name):
+    return SimpleNamespace(effect=SimpleNamespace(id=name, family="friction"))
+
+
+@pytest.mark.parametrize(
+    ("together", "left"), [(150.0, ()), (250.0, ("drag",))], ids=["chance", "confirmed"]
+)
+def test_effects_that_mask_each_other_do_not_all_go(monkeypatch, together, left):
+    """Each removed one leaves more, beside which the next is hardly seen; the whole model knows."""
+
+    def alone(state, base, chosen, *_):
+        return [
+            replace(evidence(10.0 * k, 0.0), loss=Loss(one, 0.0, 1, 1.0, Inflation(1.0, 9)))
+            for k, one in enumerate(chosen)
+        ]
+
+    def lost(base, one, fit):
+        return Loss(one, together, 1, 1.0, Inflation(1.0, 9))
+
+    monkeypatch.setattr(judging, "_evidence", alone)
+    monkeypatch.setattr(judging, "fit_state", lambda assembly, *_, **__: assembly)
+    monkeypatch.setattr(judging, "start_from", lambda *_: None)
+    monkeypatch.setattr(judging, "loss_of", lost)
+    monkeypatch.setattr(judging, "judged", lambda *states: states)
+    monkeypatch.setattr(judging, "fall_on_hold_out", lambda *_: Fall(together, 100.0, 500.0))
+    whole = Effects("friction", "drag")
+    whole.hold_errors = SimpleNamespace(entries=["held out"])
+    notes: list[str] = []
+    roles = SimpleNamespace(strategy="declared")
+    found = judged_together(whole, roles, None, 12.0, notes, lambda _: None)
+    assert found.added == left
+    assert notes[0].startswith("friction was removed again")
+    if left:
+        assert notes[1].startswith(f"{TOGETHER}; drag: without it and those removed before it")
+    else:
+        assert notes[1].startswith("drag was removed again")
 
 
 def test_what_confirmed_effects_that_went_is_not_said_of_none(tmp_path):
