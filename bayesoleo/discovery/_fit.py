@@ -622,7 +622,9 @@ def for_sampling(fit: ModelFit) -> ModelFit:
         return fit
     most, unseen = SAMPLED * fit.policy.mesh_shift, fit.policy.unseen
     found = _on_fewest_steps(fit, lambda shift, squares: shift <= most and squares <= unseen)
-    found.problem.signatures = fit.problem.signatures
+    # What an error model was told of this estimate holds on fewer steps too.
+    own, known = found.problem, fit.problem
+    own.signatures, own.effective, own.stretch = known.signatures, known.effective, known.stretch
     return found
 
 

@@ -349,11 +349,8 @@ def with_estimated_starts(model: Model, shown: Model | None = None) -> Model:
         equation holds has no choice: it starts in equilibrium.
     """
     for name in undeclared_starts(model):
-        known = shown is not None and name in shown.dofs
-        centre, dof = (
-            centre_of(shown if shown is not None and known else model, name),
-            model.dofs[name],
-        )
+        by = shown if shown is not None and name in shown.dofs else model
+        centre, dof = centre_of(by, name), model.dofs[name]
         if not _has_rate(model, name):
             model = replace(model, dofs={**model.dofs, name: replace(dof, initial=EQUILIBRIUM)})
             continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,9 @@ from bayesoleo.discovery._fit import (
     for_comparison,
     for_sampling,
 )
+from bayesoleo.error_models import Stretch
 from bayesoleo.model import Dof, Model, Output, Parameter
+from bayesoleo.model._priors import Transforms
 from bayesoleo.prediction._mesh_steps import WHOLE, coarsest_steps, whole_steps
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Harmonics, Record, transient_record
@@ -125,6 +128,19 @@ def test_a_posterior_stays_where_it_is_on_fewer_steps(fit: ModelFit) -> None:
         for one in (fit, found)
     )
     assert np.ptp(fine - coarse) < 0.1 + 0.01 * np.ptp(fine)
+
+
+def test_what_an_error_model_was_told_is_known_on_fewer_steps(fit: ModelFit) -> None:
+    """A fit that was moved to the mode under such errors tells its problem no second time."""
+    problem = copy(fit.problem)
+    problem.effective = np.full((1, 1), 50.0)
+    wide = 4.0 * fit.point.covariance
+    transforms = Transforms.of(problem.priors)
+    problem.stretch = Stretch.of(transforms, fit.point.theta, fit.point.covariance, wide)
+    found = for_sampling(replace(fit, problem=problem))
+    assert found.steps <= fit.steps
+    assert found.problem.effective is problem.effective
+    assert found.problem.stretch is problem.stretch
 
 
 def test_steps_that_were_asked_for_are_sampled_on(fit: ModelFit) -> None:
