@@ -141,8 +141,9 @@ def _absolute_gain(model: Model, channel: str, names: Names) -> Model:
 def _lag(model: Model, channel: str, names: Names) -> Model:
     lag = names["sensor_lag"]
     if channel in model.inputs:
-        # To the first order only: with more derivatives of it no other channel could drive.
-        return _correct_input(model, channel, lambda x, rate: x + lag * rate)
+        orders = range(_DERIVATIVES)
+        table = {derivative_symbol(channel, k): _later(channel, k, lag, 2) for k in orders}
+        return substitute(model, table)
     shown = model.output(channel)
     return model.with_term("output", channel, "sensor_lag", _before(model, shown, lag) - shown)
 

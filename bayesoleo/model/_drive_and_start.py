@@ -5,8 +5,8 @@ displacement is then the clean input, and the force is the response. If the cont
 output map is a dof itself, the dof is replaced by the input with its exact derivatives. Otherwise -
 an effect acts on the channel - the dof stays and the equation ``y(q, …) = x`` is added.
 
-Where the rate of the former input also appears (a lagging sensor shows ``F + tau dot(F)``), the
-response ``F`` becomes a dof of first order.
+Where rates of the former input also appear (behind a lagging sensor ``F + tau dot(F) + tau^2 / 2
+ddot(F)`` acts), the response ``F`` becomes a dof of that order.
 
 A dof declares its start, its state at a run's first sample, with ``Dof(initial=...)``: an
 expression over parameters (so that a start may be estimated, or depend on estimated ones),
@@ -90,7 +90,7 @@ def _driven(like: Structured, channel: str) -> Model:
             hint=f"drive it by one of: {', '.join(possible_drives(model))}",
         )
     dof, freed = found
-    if _orders(model.equation(dof), freed) == {0, 1}:
+    if _lags(_orders(model.equation(dof), freed)):
         driven = _exchange_lagging(model, channel, dof, freed)
         measured = model.output(channel)
     else:
@@ -128,17 +128,24 @@ def _freed_input(model: Model, channel: str) -> tuple[str, str] | None:
 def _appears_once(model: Model, name: str, dof: str, channel: str) -> bool:
     """Whether an input enters the dof's equation only, and the channel itself.
 
-    It may enter the equation with its rate, if linearly and not the channel as well.
+    It may enter the equation with its rates, if linearly and not the channel as well.
     """
     own = _orders(model.equation(dof), name)
     others = [model.equation(other) for other in model.dofs if other != dof]
     others += [model.output(other) for other in model.outputs if other != channel]
     if any(_orders(expression, name) for expression in others):
         return False
-    if own == {0, 1}:
-        rate = partial(model.equation(dof), derivative_symbol(name, 1))
-        return not _orders(rate, name) and not _orders(model.output(channel), name)
+    if _lags(own):
+        equation = model.equation(dof)
+        rates = [partial(equation, derivative_symbol(name, order)) for order in own if order]
+        linear = not any(_orders(rate, name) for rate in rates)
+        return linear and not _orders(model.output(channel), name)
     return own == {0}
+
+
+def _lags(orders: set[int]) -> bool:
+    """Whether these are derivatives of an input as a lag brings them, up to the second."""
+    return orders in ({0, 1}, {0, 1, 2})
 
 
 def _orders(expression: sp.Expr, name: str) -> set[int]:
@@ -174,15 +181,15 @@ def _exchange(
 
 
 def _exchange_lagging(model: Model, channel: str, dof: str, freed: str) -> Model:
-    """The same where the freed input enters with its rate: the equation rules a new dof."""
+    """The same where the freed input enters with its rates: the equation rules a new dof."""
     taken = {*model.dofs, *model.inputs, *model.parameters, *model.conditions, *model.definitions}
     state = f"{freed}_answer"
     while state in taken:
         state += "_"
-    rates = {derivative_symbol(freed, 1): derivative_symbol(state, 1)}
+    rates = {derivative_symbol(freed, order): derivative_symbol(state, order) for order in (1, 2)}
     table = {symbol(freed): symbol(state)} | rates
     terms = {name: term.xreplace(table) for name, term in model.equations[dof].items()}
-    # The answer takes the state's rate only, so that where the rate does not count it is as exact
+    # The answer takes the state's rates only, so that where these do not count it is as exact
     # as without a state: interpolating the state itself would blur the jumps of dry friction.
     answer = {name: e.xreplace(rates) for name, e in _solve_for_input(model, dof, freed).items()}
     return _exchange(

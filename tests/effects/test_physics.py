@@ -198,6 +198,26 @@ def test_a_channel_that_lags_shows_what_was(scales):
     assert np.allclose(law(*rates, 1.0, 0.0), old, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("channel", ["position", "force"])
+def test_a_lag_of_an_input_and_of_the_output_are_one(scales, channel):
+    """What was measured late is taken forward as far as the other channel is taken back: of a sine
+    that lags by a tenth of a radian the third order is left of an input."""
+    model = Model(
+        "force law",
+        inputs={"position": "m"},
+        parameters={"mass": Parameter(1.0, "kg", sd=1.0)},
+        outputs={"force": "mass*ddot(position)"},
+    )
+    output = find_effect("sensor_lag").extend(model, channel, scales).model.output("force")
+    lag, phase = 0.1, np.linspace(0.0, 2 * np.pi, 500)
+    names = [derivative_symbol("position", k) for k in range(6)]
+    sign = 1.0 if channel == "position" else -1.0  # a force that leads is a position that lags
+    law = sp.lambdify([*names, symbol("mass"), symbol(f"sensor_lag_{channel}")], output, "numpy")
+    late = [np.sin(phase - lag + k * np.pi / 2) for k in range(6)]
+    left = np.abs(law(*late, 1.0, sign * lag) + np.sin(phase))
+    assert left.max() < 1.05 * lag**3 / 6
+
+
 def test_a_lag_takes_a_temperature_back_by_its_balance(scales):
     """Of a first-order state that answers a sine the third order in the lag is left."""
     model = Model(

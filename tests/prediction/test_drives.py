@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from synthetic_runs import CONDITIONS, harmonics, oleo_runs, run, stroke
 
+from bayesoleo.effects import Scales, find_effect
 from bayesoleo.model import Model, Output, Parameter
 from bayesoleo.model._drive_and_start import driven_by
 from bayesoleo.prediction._predictor import Predictor
@@ -128,6 +129,30 @@ def test_compliance_against_integration():
     # ms.
     error = np.sqrt(np.mean((force[late] - exact) ** 2)) / scale
     assert error < 2e-3
+
+
+@pytest.mark.parametrize("lag", [0.0, 1e-4, 0.01])
+def test_a_force_that_was_measured_late_answers_a_motion(lag):
+    """By the series of what acts, ``F + tau F' + tau^2 F'' / 2``, solved for the force measured."""
+    base = Model(
+        "spring",
+        inputs={"force": "N"},
+        dofs={"y": "m"},
+        parameters={"stiffness": Parameter(50.0, "N/m", sd=5.0)},
+        equations={"y": "2*ddot(y) + stiffness*y - force"},
+        outputs={"position": Output("y", "m")},
+    )
+    late = find_effect("sensor_lag").extend(base, "force", Scales({}, {}, {}, 1.0, 1.0)).model
+    model = driven_by(late.with_values({"sensor_lag_force": lag}), "position")
+    moved = harmonics([1, 3], [1.0, 0.2j])
+    record = run("driven", {"position": moved}, 2.0, conditions={}, others=("force",))
+    _, found = predicted(model, [record], 256)
+    omega = 2j * np.pi * 2.0 * moved.orders
+    acts = (2.0 * omega**2 + 50.0) * moved.coefficients
+    shown = harmonics(moved.orders, acts / (1 + lag * omega + (lag * omega) ** 2 / 2))
+    exact = shown.evaluate(record.phase, record.frequency)
+    # Of third order, with 85 steps for the third harmonic.
+    np.testing.assert_allclose(found[0].y[0], exact, atol=2e-5 * np.abs(exact).max())
 
 
 def test_every_derivative_of_an_input_reaches_the_equation():
