@@ -41,6 +41,7 @@ from bayesoleo.discovery._inference import (
 from bayesoleo.discovery._result_tree import point_group, posterior_groups, predictive_groups
 from bayesoleo.discovery._run_predictions import Prediction, predict_held_out
 from bayesoleo.discovery._scanned_columns import Scanned
+from bayesoleo.error_models._correlated import PowerErrors
 from bayesoleo.error_models._registry import AUTO
 from bayesoleo.estimation._per_run import by_run_dataset
 from bayesoleo.model._model import Model
@@ -298,8 +299,10 @@ def draw(
         inference = inference_for(task, fit, task.assembly, callback)
     if inference.reason:
         callback(inference.reason)
-    sampled = for_sampling(fit)
-    density = inference.density(sampled, settings.jobs)
+    inference.tell(fit)
+    effective = fit.problem.effective if inference.error_model == PowerErrors.word else None
+    sampled = for_sampling(fit, effective)
+    density = inference.density(sampled, settings.jobs, told=True)
     of = [task.campaign.sha256, fit.model.digest(), sampled.steps, settings.scheme]
     of += [] if settings.solver == COLLOCATION else [settings.solver]
     of += [] if inference.error_model == settings.error_model else [inference.error_model]

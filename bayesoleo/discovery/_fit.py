@@ -601,7 +601,7 @@ def for_comparison(fit: ModelFit) -> ModelFit:
     return _on_fewest_steps(fit, lambda _, squares: squares <= fit.policy.unseen)
 
 
-def for_sampling(fit: ModelFit) -> ModelFit:
+def for_sampling(fit: ModelFit, effective: Array | None = None) -> ModelFit:
     """A fit on the coarsest mesh that leaves the posterior where it is.
 
     A density is computed some ten thousand times. Steps that move no parameter by a tenth of what
@@ -612,6 +612,9 @@ def for_sampling(fit: ModelFit) -> ModelFit:
     Parameters
     ----------
     fit : ModelFit
+    effective : ndarray, shape (N, s), optional
+        Number of samples that count, of each run and output, where the density takes its
+        likelihood to that power: what the samples tell is then less, and its deviations wider.
 
     Returns
     -------
@@ -620,7 +623,9 @@ def for_sampling(fit: ModelFit) -> ModelFit:
     """
     if fit.numerics.steps is not None or not fit.model.dofs:
         return fit
-    most, unseen = SAMPLED * fit.policy.mesh_shift, fit.policy.unseen
+    counts = np.maximum(fit.problem.counts, 1)
+    told = 1.0 if effective is None else float(np.max(effective / counts))
+    most, unseen = SAMPLED * fit.policy.mesh_shift / np.sqrt(told), fit.policy.unseen / told
     found = _on_fewest_steps(fit, lambda shift, squares: shift <= most and squares <= unseen)
     # What an error model was told of this estimate holds on fewer steps too.
     own, known = found.problem, fit.problem

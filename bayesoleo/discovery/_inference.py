@@ -119,13 +119,21 @@ class Inference:
         chosen = {name: replace(model.parameters[name], by_run=True) for name in self.between_runs}
         return model.with_parameters(**chosen) if chosen else model
 
-    def density(self, fit: ModelFit, jobs: int | None = None) -> LogDensity:
-        """The log posterior density of a fitted model; the solver starts from the estimate."""
+    def tell(self, fit: ModelFit) -> None:
+        """Tell a fit's problem what the error model needs to know of the estimate."""
+        # The covariance of a fit that was moved to the mode under these errors contains them.
+        if fit.point.objective_name != self.error_model:
+            _tell(self.error_model, fit)
+
+    def density(self, fit: ModelFit, jobs: int | None = None, *, told: bool = False) -> LogDensity:
+        """The log posterior density of a fitted model; the solver starts from the estimate.
+
+        With ``told`` the fit's problem knows what :meth:`tell` says.
+        """
         problem, point = fit.problem, fit.point
         unknowns = None
-        # The covariance of a fit that was moved to the mode under these errors contains them.
-        if point.objective_name != self.error_model:
-            _tell(self.error_model, fit)
+        if not told:
+            self.tell(fit)
         if self.between_runs:
             unknowns = hierarchical(
                 problem, self.between_runs, theta=point.theta, errors=self.error_model

@@ -130,6 +130,25 @@ def test_a_posterior_stays_where_it_is_on_fewer_steps(fit: ModelFit) -> None:
     assert np.ptp(fine - coarse) < 0.1 + 0.01 * np.ptp(fine)
 
 
+def test_a_wider_posterior_is_sampled_on_fewer_steps(fit: ModelFit) -> None:
+    """Where samples count less, parameters may move by more: in units of the wider deviations they
+    stay where they are."""
+    steps, tells = [], (1.0, 0.1, 1e-3, 1e-6)
+    for told in tells:
+        found = for_sampling(fit, told * fit.problem.counts)
+        steps.append(found.steps)
+        if found.steps < fit.steps:
+            moved = fit_model(
+                fit.model, fit.records, replace(fit.numerics, steps=found.steps),
+                start=fit.point.theta, share=found.predictor, check_mesh=False,
+            )  # fmt: skip
+            away = np.abs(moved.point.theta - fit.point.theta) / fit.point.sd * np.sqrt(told)
+            assert away.max() < 2.0 * SAMPLED * fit.policy.mesh_shift
+    assert steps[0] == for_sampling(fit).steps
+    assert steps == sorted(steps, reverse=True)
+    assert steps[-1] < steps[0]
+
+
 def test_what_an_error_model_was_told_is_known_on_fewer_steps(fit: ModelFit) -> None:
     """A fit that was moved to the mode under such errors tells its problem no second time."""
     problem = copy(fit.problem)
