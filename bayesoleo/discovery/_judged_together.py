@@ -8,7 +8,9 @@ higher. Where no hold-out run is declared, or none shows the effect, the error o
 must be, after the correction for the search. The effect that misses this most is removed, and the
 others are judged again. What is removed leaves more, beside which the next one is hardly seen: so
 all that were removed are judged with it too, in the model that had them. Where they are confirmed
-together, it stays. A smooth function that stands for no name is not judged here.
+together, it stays. That is a second chance, so that the false alarms that are allowed are halved,
+and on fitted runs the correction is for the search of as many effects. A smooth function that
+stands for no name is not judged here.
 """
 
 from __future__ import annotations
@@ -153,9 +155,13 @@ class _Whole:
         """What the data say for an effect and all that a model lacks besides, as they do for one
         alone."""
         loss, fall = loss_of(self.base, alone.loss.step, after.fit), None
+        policy = replace(alone.policy, false_confirmation=alone.policy.false_confirmation / 2.0)
         if self.state.hold_errors.entries and np.isfinite(loss.rise):
             fall = fall_on_hold_out(*judged(after, self.state), loss.noise.on_trial)
-        return replace(alone, loss=loss, fall=fall, others=True)
+            fall = replace(fall, policy=policy)
+        lacks = len(self.state.assembly.steps) - len(after.assembly.steps)
+        tests = 2.0 * alone.tests**lacks
+        return replace(alone, loss=loss, fall=fall, tests=tests, policy=policy, others=True)
 
 
 def _without_one(

@@ -161,7 +161,10 @@ def step(name):
 
 
 @pytest.mark.parametrize(
-    ("together", "left"), [(150.0, ()), (250.0, ("drag",))], ids=["chance", "confirmed"]
+    ("together", "left"),
+    # Two chances to stay: half of the false alarms for each, 2.24 standard errors instead of 1.96.
+    [(150.0, ()), (215.0, ()), (250.0, ("drag",))],
+    ids=["chance", "second chance", "confirmed"],
 )
 def test_effects_that_mask_each_other_do_not_all_go(monkeypatch, together, left):
     """Each removed one leaves more, beside which the next is hardly seen; the whole model knows."""
@@ -192,6 +195,17 @@ def test_effects_that_mask_each_other_do_not_all_go(monkeypatch, together, left)
         assert notes[1].startswith(f"{TOGETHER}; drag: without it and those removed before it")
     else:
         assert notes[1].startswith("drag was removed again")
+
+
+def test_effects_together_are_corrected_for_the_search_of_as_many(monkeypatch):
+    """Of a hundred candidates there are ten thousand pairs."""
+    monkeypatch.setattr(judging, "loss_of", lambda *_: Loss(STEP, 60.0, 2, 1.0, Inflation(1.0, 0)))
+    whole = judging._Whole(Effects("friction", "drag", "play"), None)
+    alone = Evidence(Loss(STEP, 60.0, 1, 1.0, Inflation(1.0, 0)), None, 100.0, declared=False)
+    joint = whole.evidence(alone, Effects("play"))
+    assert joint.p == pytest.approx(2.0 * 100.0**2 * stats.chi2.sf(60.0, 2), rel=1e-3)
+    one = whole.evidence(alone, Effects("play", "drag"))
+    assert one.p == pytest.approx(2.0 * 100.0 * stats.chi2.sf(60.0, 2), rel=1e-3)
 
 
 def test_what_confirmed_effects_that_went_is_not_said_of_none(tmp_path):
