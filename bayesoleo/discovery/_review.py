@@ -20,7 +20,12 @@ from bayesoleo.discovery._alternatives import Loss, dispersion, eliminated, loss
 from bayesoleo.discovery._assembly import AddedEffect, Roles
 from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._fit_difference import undecided
-from bayesoleo.discovery._hold_out_confirmation import confirmed, contradicted
+from bayesoleo.discovery._hold_out_confirmation import (
+    confirmed,
+    contradicted,
+    fall_on_hold_out,
+    judged,
+)
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import (
     ABSORBING_FAMILIES,
@@ -41,7 +46,7 @@ from bayesoleo.discovery._refit import (
 from bayesoleo.discovery._round import Progress, Round
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score
-from bayesoleo.discovery._state import fit_state
+from bayesoleo.discovery._state import State, fit_state
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._nonparametric import FAMILY
 
@@ -380,6 +385,8 @@ def _replaced(
         return None
     if contradicted(final, after, better.refit.noise.on_trial):
         return None
+    if not after.at_floor and _raises(final, after, better.refit.noise.on_trial):
+        return None
     gained = better.refit.worth - place.own.refit.worth
     way = f"lower by {gained:.3g}" if gained > 0 else f"higher by {-gained:.3g} only"
     reason += (
@@ -393,6 +400,17 @@ def _replaced(
     last = Round(before, ranking, {}, better, after, reason, tests)
     rounds = (*progress.rounds[:-1], last)
     return Progress(progress.first, state, rounds, tuple(notes))
+
+
+def _raises(before: State, after: State, inflation: float) -> bool:
+    """Whether a model predicts runs that were not fitted worse than another one.
+
+    Where both leave more than noise, the likelihood of the fitted runs overstates the evidence for
+    either: what it prefers must at least predict as well.
+    """
+    if not before.hold_errors.entries:
+        return False
+    return fall_on_hold_out(*judged(before, after), inflation).value < 0.0
 
 
 def _with_class(progress: Progress, place: Place) -> Progress:
