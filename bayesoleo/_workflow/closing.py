@@ -6,6 +6,7 @@ ranks new runs by how well they separate the candidate effects.
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -37,6 +38,7 @@ from bayesoleo.discovery._loop import ClosedLoop, close_loop, loop_of
 from bayesoleo.discovery._next_experiment import check_aim
 from bayesoleo.discovery._open_questions import Question, questions_of
 from bayesoleo.discovery._round import Progress
+from bayesoleo.discovery._work import QUICK
 from bayesoleo.effects._catalogue import catalogue, catalogue_titles, with_titles
 from bayesoleo.error_models._registry import AUTO
 from bayesoleo.errors import ResultsError
@@ -219,6 +221,8 @@ def search(
 ) -> tuple[ClosedLoop, tuple[Question, ...]]:
     """The loop of :func:`run_loop`, and the runs that would tell apart what it could not."""
     loop = run_loop(task, max_effects, stages, output, resume=resume)
+    if not loop.complete:
+        return loop, ()  # what it would have found is not among what a run were to tell apart
     ask = partial(what_next, task, loop, stages.callback)
     return loop, stages.attempt(PROPOSALS_STAGE, ask, no_questions)
 
@@ -274,6 +278,7 @@ def run_loop(
             seed=settings.seed,
             max_effects=max_effects,
             nonparametric=settings.nonparametric,
+            most_work=QUICK if settings.quick else math.inf,
             known=known,
             prior=settings.structure_prior,
             keep=keep,

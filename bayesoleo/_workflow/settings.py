@@ -224,7 +224,7 @@ class Settings:
         Other processes or machines that take part: ``local:4``, or the address of a Dask scheduler.
         Results do not depend on them either.
     quick : bool
-        Draw enough for two-digit intervals only.
+        Draw enough for two-digit intervals only, and end a search early that takes minutes.
     effective_size : int
         Effective draws asked of the sampler.
     scheme : str
@@ -282,7 +282,10 @@ class Settings:
         metavar="N",
         show_default="all cores",
     )
-    quick: bool = _setting(False, bool, RUNNING, "Draw enough for intervals of two digits only.")
+    quick: bool = _setting(
+        False, bool, RUNNING,
+        "Draw enough for intervals of two digits only, and end a long search early.",
+    )  # fmt: skip
     effective_size: int = _setting(
         1000, int, RUNNING, "Draw until every parameter has this effective sample size.",
         min=10, metavar="N",

@@ -35,6 +35,7 @@ from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._state import State, better_start, fit_state, state_of
 from bayesoleo.discovery._structure_search import DEFAULT_PRIOR, structure_posterior
 from bayesoleo.discovery._structures import StructurePosterior, StructurePrior
+from bayesoleo.discovery._work import ENDED, work_of
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._nonparametric import FAMILY
 
@@ -301,6 +302,7 @@ def close_loop(
     seed: int = 0,
     max_effects: int = 6,
     nonparametric: bool = True,
+    most_work: float = np.inf,
     known: Progress | None = None,
     prior: StructurePrior = DEFAULT_PRIOR,
     keep: Callable[[Progress], None] = lambda _: None,
@@ -326,6 +328,9 @@ def close_loop(
         Largest number of effects to add.
     nonparametric : bool
         Whether a smooth function may be added where no named effect explains the residual.
+    most_work : float
+        Work after which the search goes no further: what was added is judged, but nothing else is
+        added, reviewed or replaced. Samples that estimates predicted, times their unknowns.
     known : Progress, optional
         Progress of the same search, stopped before, from which it resumes.
     prior : StructurePrior, optional
@@ -349,8 +354,11 @@ def close_loop(
         known = _begun(assembly, roles, numerics, declared, callback)
         keep(known)
     search = SearchOptions(
-        roles, numerics, effects, seed, max_effects, nonparametric, keep, callback, keep_columns
-    )
+        roles, numerics, effects, seed, max_effects, nonparametric, keep, callback, keep_columns,
+        most_work,
+    )  # fmt: skip
+    if _went_no_further(known) and not search.ends(known):
+        known = replace(known, rounds=known.rounds[:-1])
     known = searched(known, search)
 
     def follow(other: Progress, most: int) -> Progress:
@@ -364,7 +372,11 @@ def close_loop(
         return searched(other, quiet)
 
     roles = _with_noise(roles, known)
-    known = best_of_beam(known, roles, numerics, follow, effects, max_effects, callback)
+    if not _went_no_further(known):
+        known = best_of_beam(known, roles, numerics, follow, effects, max_effects, callback)
+    if _went_no_further(known):
+        # What it would have found is not among what probabilities are of.
+        return loop_of(known.ended(ENDED), roles)
     loop = loop_of(known, roles)
     try:
         structures = probabilities(known, numerics, prior, callback)
@@ -432,12 +444,24 @@ class SearchOptions:
     keep: Callable[[Progress], None]
     callback: ProgressCallback
     keep_columns: bool = False
+    most_work: float = np.inf
+
+    def ends(self, known: Progress) -> bool:
+        """Whether a search has done the work after which it goes no further."""
+        return self.most_work < np.inf and work_of(known) > self.most_work
+
+
+def _went_no_further(known: Progress) -> bool:
+    """Whether a search was ended by the work that it had done."""
+    return known.finished and known.rounds[-1].reason == ENDED
 
 
 def searched(known: Progress, search: SearchOptions) -> Progress:
     """Continue a search to its end, with a review of its final effects."""
     for left in reversed(range(search.max_effects + 1)):
         known = _rounds(known, search)
+        if _went_no_further(known):
+            break
         roles = _with_noise(search.roles, known)
         known = reviewed(
             known, roles, search.numerics, search.effects, search.callback, replacing=left > 0
@@ -457,6 +481,8 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
         rounds, state, notes = known.rounds, known.state, list(known.notes)
         callback(f"round {len(rounds) + 1}: {_ratios(state)}")
         limit = JUDGED if state is together else _limit(state, len(rounds), max_effects)
+        if search.ends(known):
+            limit = ENDED
         outcome = None if limit else _looked_at(ahead, state, roles)
         outcome = outcome or examine(
             state,
@@ -483,7 +509,8 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
             if together is not state:
                 known = replace(known, state=together, notes=tuple(notes))
                 continue
-        if outcome.after is None and search.nonparametric and max_effects > 0:
+        curves = search.nonparametric and max_effects > 0 and outcome.reason != ENDED
+        if outcome.after is None and curves:
             opening = rounds[0] if rounds else outcome
             room = len(state.assembly.steps) < max_effects
             outcome = with_nonparametric(

@@ -42,8 +42,8 @@ CLIMBS, QUICK_CLIMBS = 32, 16
 #: Fraction of the evaluations that the mode search may take.
 SEARCHING = 0.25
 #: Evaluations of the log density at which a quick run ends, converged or not, and time steps in all
-#: after which it ends too, but not before this number of moves of each walker: a few minutes.
-QUICK_EVALUATIONS, QUICK_TIME_STEPS, QUICK_STEPS = 40_000, 100_000_000, 64
+#: after which it ends too, but not before this number of moves of each walker: half a minute.
+QUICK_EVALUATIONS, QUICK_TIME_STEPS, QUICK_STEPS = 40_000, 70_000_000, 64
 #: Acceptance of the independence move below which its mixture misses the posterior.
 MISSES = 0.15
 #: Draws that are handed on at least, where each one costs a factorisation for each run, and by

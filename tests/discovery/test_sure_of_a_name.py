@@ -215,7 +215,7 @@ def test_what_was_found_stands_where_probabilities_fail(error, monkeypatch):
 
 def closed_without_probabilities(error, monkeypatch):
     """What was found, and the loop that ends with an error where probabilities are computed."""
-    found, progress = loop(), SimpleNamespace(first=None, state=None)
+    found, progress = loop(), SimpleNamespace(first=None, state=None, finished=False)
 
     def fails(*_):
         raise error
