@@ -40,12 +40,13 @@ study.text("before_after", lambda: print_before_after(summary, "mrad", 1e3))
 figure = study.figure("course", lambda: pages.course(tree, "angle", "validation 1", 1e3, "mrad"))
 
 # %%
-# The error falls to a quarter, and what was found is a likeness: power-law damping and Dahl
-# friction, a constant force of each run's own, an end stop and a function of the velocity. All six
-# records are pieces of one decay, from 1.6 rad to 0.3: what differs from run to run is what changes
-# with the amplitude. Dry friction with drag of the air is a pair, and no effect alone.
-# ``python tests/benchmarks/measured_limits.py --only pendulum`` fits it by code of its own: sharp
-# Coulomb friction, drag and a constant force leave 0.94 mrad of the fitted records and 4.3 mrad of
-# the others. Friction over a wide range of velocities leaves 0.84 and 9.5 mrad: the fitted records
-# prefer the law that predicts worse. The search leaves 0.37 and 2.8 mrad. The comparison of whole
-# structures is sure of one thing only: something outside the catalogue acts.
+# The error falls to a half, and what was found is a likeness: power-law damping, and Dahl friction,
+# which these data do not tell from Coulomb and other friction, nor from quadratic damping. Dry
+# friction with drag of the air is a pair, and no effect alone. The quick search ends there. Before
+# it was limited it went on for twelve minutes of computing, and reached 0.37 and 2.8 mrad with a
+# constant force of each run's own, an end stop and a function of the velocity besides: all six
+# records are pieces of one decay, from 1.6 rad to 0.3, so that what differs from run to run is what
+# changes with the amplitude. ``python tests/benchmarks/measured_limits.py --only pendulum`` fits
+# them by code of its own: sharp Coulomb friction, drag and a constant force leave 0.94 mrad of the
+# fitted records and 4.3 mrad of the others. Friction over a wide range of velocities leaves 0.84
+# and 9.5 mrad: the fitted records prefer the law that predicts worse.
