@@ -24,6 +24,7 @@ from bayesoleo._report.tables import (
 )
 from bayesoleo.data import _frequency_response as response
 from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._work import ENDED
 from bayesoleo.effects._catalogue import (
     PROPER,
     called,
@@ -58,7 +59,7 @@ def headline(summary: Mapping[str, Any]) -> str:
     """The result as a sentence, which begins with how sure it is."""
     broken = any(item["stage"] == "search" for item in summary.get(schema.UNFINISHED, []))
     lead = "Unfinished, the search did not come to its end. " if broken else ""
-    return f"{lead}{_said(summary)}{_not_tried(summary)}"
+    return f"{lead}{_said(summary)}{_ended_early(summary)}{_not_tried(summary)}"
 
 
 def headline_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
@@ -81,6 +82,14 @@ def headline_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
     subject = "It explains" if len(summary["effects"]) == 1 else "They explain"
     # A title of its own leaves its participle without a sentence.
     return f"{text[:first]}.", begin(re.sub("^explaining", subject, rest))
+
+
+def _ended_early(summary: Mapping[str, Any]) -> str:
+    """A sentence on a quick search that went no further; empty of any other."""
+    last = summary["rounds"][-1] if summary["rounds"] else {}
+    if last.get("reason") != ENDED:
+        return ""
+    return " The quick search ended there: without --quick it goes on."
 
 
 def _not_tried(summary: Mapping[str, Any]) -> str:

@@ -17,7 +17,7 @@ from bayesoleo.discovery._round import Progress
 QUICK = 3e8
 #: Why a quick search goes no further.
 ENDED = (
-    "a quick search goes no further: without --quick it looks for further effects, reviews those"
+    "a quick search goes no further; without --quick it looks for further effects, reviews those"
     " that were added, and says how probable they are"
 )
 

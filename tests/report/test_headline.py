@@ -10,6 +10,7 @@ from bayesoleo import _schema as schema
 from bayesoleo._report import tables as yardstick
 from bayesoleo._report.sentences import headline, headline_parts
 from bayesoleo._workflow.settings import Settings
+from bayesoleo.discovery._work import ENDED
 from bayesoleo.effects import catalogue
 from bayesoleo.effects._catalogue import called, in_sentence, parameter_called, with_titles
 
@@ -106,6 +107,17 @@ def test_a_search_that_broke_off_is_said_first():
     assert text.startswith(f"{lead}Probable: play (x) was missing")
     late = [{"stage": "posterior", "reason": "NameError: x"}]
     assert told(["play @ x"], schema.PROBABLE, unfinished=late).startswith("Probable: ")
+
+
+@pytest.mark.parametrize("names", [[], ["coulomb_friction @ x"]], ids=["none", "one"])
+def test_a_quick_search_that_went_no_further_says_so(names):
+    sure = schema.LIKENESS if names else None
+    plain = told(names, sure, ratio=3.0, verdict=schema.UNEXPLAINED)
+    summary = summary_of(names, sure, ratio=3.0, verdict=schema.UNEXPLAINED)
+    summary["rounds"] = [*summary["rounds"][:-1], {**summary["rounds"][-1], "reason": ENDED}]
+    text = headline(summary)
+    assert text == f"{plain} The quick search ended there: without --quick it goes on."
+    assert headline_parts(summary)[1].endswith("without --quick it goes on.")
 
 
 def test_a_run_that_alone_is_too_large_is_named():
