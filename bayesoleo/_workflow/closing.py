@@ -212,7 +212,7 @@ def written(
             raise
         tree = found
     stages.finish(tree, output.folder)
-    output.finish()
+    output.finish(ended=loop.complete)
     return tree
 
 
@@ -278,7 +278,7 @@ def run_loop(
             seed=settings.seed,
             max_effects=max_effects,
             nonparametric=settings.nonparametric,
-            most_work=QUICK if settings.quick else math.inf,
+            most_work=QUICK if settings.quick and max_effects > 0 else math.inf,
             known=known,
             prior=settings.structure_prior,
             keep=keep,

@@ -163,12 +163,12 @@ class ResultFolder:
         older = not self.begun and (self.folder / RESULTS).exists()
         return older or time.monotonic() - self._written > OFTEN
 
-    def finish(self) -> None:
-        """Drop the older result, and what the search would go on from: the new one is complete."""
+    def finish(self, *, ended: bool = True) -> None:
+        """Drop the older result; and what the search would go on from, unless a longer one may."""
         if self.folder is not None and self.checkpoints is not None:
             _drop(self.folder / OLDER)
-            # Fits of many candidates take tens of megabytes.
-            (self.checkpoints / SEARCH).unlink(missing_ok=True)
+            if ended:  # fits of many candidates take tens of megabytes
+                (self.checkpoints / SEARCH).unlink(missing_ok=True)
 
     # -- how far a search has come ------------------------------------------------------
 

@@ -8,9 +8,9 @@ higher. Where no hold-out run is declared, or none shows the effect, the error o
 must be, after the correction for the search. The effect that misses this most is removed, and the
 others are judged again. What is removed leaves more, beside which the next one is hardly seen: so
 all that were removed are judged with it too, in the model that had them. Where they are confirmed
-together, it stays. That is a second chance, so that the false alarms that are allowed are halved,
-and on fitted runs the correction is for the search of as many effects. A smooth function that
-stands for no name is not judged here.
+together, it stays. That is a second chance, for which half as many false alarms are allowed, and on
+fitted runs the correction is for the search of as many effects. A smooth function that stands for
+no name is not judged here.
 """
 
 from __future__ import annotations

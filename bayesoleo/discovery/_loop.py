@@ -357,8 +357,6 @@ def close_loop(
         roles, numerics, effects, seed, max_effects, nonparametric, keep, callback, keep_columns,
         most_work,
     )  # fmt: skip
-    if _went_no_further(known) and not search.ends(known):
-        known = replace(known, rounds=known.rounds[:-1])
     known = searched(known, search)
 
     def follow(other: Progress, most: int) -> Progress:
@@ -368,15 +366,15 @@ def close_loop(
             nonparametric=False,
             keep=lambda _: None,
             keep_columns=False,
+            most_work=np.inf,
         )
         return searched(other, quiet)
 
     roles = _with_noise(roles, known)
-    if not _went_no_further(known):
-        known = best_of_beam(known, roles, numerics, follow, effects, max_effects, callback)
     if _went_no_further(known):
         # What it would have found is not among what probabilities are of.
         return loop_of(known.ended(ENDED), roles)
+    known = best_of_beam(known, roles, numerics, follow, effects, max_effects, callback)
     loop = loop_of(known, roles)
     try:
         structures = probabilities(known, numerics, prior, callback)
@@ -447,8 +445,14 @@ class SearchOptions:
     most_work: float = np.inf
 
     def ends(self, known: Progress) -> bool:
-        """Whether a search has done the work after which it goes no further."""
-        return self.most_work < np.inf and work_of(known) > self.most_work
+        """Whether a search has done the work after which it goes no further.
+
+        One whose errors are as expected is near its end, and an effect on trial waits for the one
+        that it was added for.
+        """
+        if self.most_work == np.inf or not known.rounds or known.rounds[-1].on_trial:
+            return False
+        return not known.state.at_floor and work_of(known) > self.most_work
 
 
 def _went_no_further(known: Progress) -> bool:
@@ -481,7 +485,7 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
         rounds, state, notes = known.rounds, known.state, list(known.notes)
         callback(f"round {len(rounds) + 1}: {_ratios(state)}")
         limit = JUDGED if state is together else _limit(state, len(rounds), max_effects)
-        if search.ends(known):
+        if limit in ("", JUDGED) and search.ends(known):
             limit = ENDED
         outcome = None if limit else _looked_at(ahead, state, roles)
         outcome = outcome or examine(
@@ -522,7 +526,8 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
             noise = least_noise(roles.measured, state.errors.record_noise)
             roles = replace(roles, measured=noise)
         known = known.after(outcome, state, notes)
-        search.keep(known)
+        if not _went_no_further(known):  # a longer search goes on with what was on trial
+            search.keep(known)
     return known
 
 

@@ -406,9 +406,14 @@ def _raises(before: State, after: State, inflation: float) -> bool:
     """Whether a model predicts runs that were not fitted worse than another one.
 
     Where both leave more than noise, the likelihood of the fitted runs overstates the evidence for
-    either: what it prefers must at least predict as well.
+    either: what it prefers must at least predict as well. A model with parameters of its own in
+    each run fits these to the runs that it predicts, and cannot be compared so.
     """
-    if not before.hold_errors.entries:
+    pairs = list(zip(before.held_out, after.held_out, strict=True))
+    if any(old.status.ok and not new.status.ok for old, new in pairs):
+        return True
+    alike = all(old.re_estimated == new.re_estimated for old, new in pairs)
+    if not before.hold_errors.entries or not alike:
         return False
     return fall_on_hold_out(*judged(before, after), inflation).value < 0.0
 

@@ -28,7 +28,7 @@ from bayesoleo.effects._parts import (
     period_grid,
 )
 from bayesoleo.effects._places import is_quantity, substitute
-from bayesoleo.model._drive_and_start import possible_drives
+from bayesoleo.model._drive_and_start import MAXIMUM_DERIVATIVE, possible_drives
 from bayesoleo.model._expressions import (
     TIME,
     WITHIN,
@@ -98,7 +98,7 @@ def _correct_input(
 ) -> Model:
     """Replace an input and its derivatives by ``true(x, dx/dt)`` and the derivatives of that."""
     table = {}
-    for order in range(_DERIVATIVES):
+    for order in range(MAXIMUM_DERIVATIVE):
         now, next_ = (derivative_symbol(channel, order + more) for more in (0, 1))
         shown = true(now, next_)
         # A constant offset leaves derivatives alone.
@@ -141,7 +141,7 @@ def _absolute_gain(model: Model, channel: str, names: Names) -> Model:
 def _lag(model: Model, channel: str, names: Names) -> Model:
     lag = names["sensor_lag"]
     if channel in model.inputs:
-        orders = range(_DERIVATIVES)
+        orders = range(MAXIMUM_DERIVATIVE - 1)
         table = {derivative_symbol(channel, k): _later(channel, k, lag, 2) for k in orders}
         return substitute(model, table)
     shown = model.output(channel)

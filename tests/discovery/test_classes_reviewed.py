@@ -348,3 +348,30 @@ def test_an_estimate_is_repeated_from_each_other_shape_once(monkeypatch, grid, f
     base = SimpleNamespace(policy=SearchPolicy())
     assert review._restarted((base, None, 100.0), (score, 0.0, 1.0)) is None
     assert tried == expected
+
+
+def held_out(*runs):
+    """A state by whether each hold-out run was solved, and its parameters that the run tells."""
+    found = [SimpleNamespace(status=SimpleNamespace(ok=ok), re_estimated=own) for ok, own in runs]
+    return SimpleNamespace(held_out=found, hold_errors=SimpleNamespace(entries=found))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "fall", "raises"),
+    [
+        ([(True, 0), (True, 0)], [(True, 0), (True, 0)], 5.0, False),
+        ([(True, 0), (True, 0)], [(True, 0), (True, 0)], -5.0, True),
+        ([(True, 0), (True, 0)], [(True, 0), (False, 0)], 5.0, True),
+        ([(False, 0), (True, 0)], [(True, 0), (True, 0)], 5.0, False),
+        # Of a run that a model is fitted to it predicts more than it knows.
+        ([(True, 1)], [(True, 0)], -5.0, False),
+        ([], [], -5.0, False),
+    ],
+    ids=["lower", "higher", "unsolved", "solved", "of the run", "none"],
+)
+def test_a_rival_that_leaves_more_than_noise_predicts_as_well(
+    monkeypatch, before, after, fall, raises
+):
+    monkeypatch.setattr(review, "judged", lambda *states: states)
+    monkeypatch.setattr(review, "fall_on_hold_out", lambda *_: SimpleNamespace(value=fall))
+    assert review._raises(held_out(*before), held_out(*after), 1.0) is raises

@@ -162,7 +162,7 @@ def step(name):
 
 @pytest.mark.parametrize(
     ("together", "left"),
-    # Two chances to stay: half of the false alarms for each, 2.24 standard errors instead of 1.96.
+    # A second chance has half as many false alarms: 2.24 standard errors instead of 1.96.
     [(150.0, ()), (215.0, ()), (250.0, ("drag",))],
     ids=["chance", "second chance", "confirmed"],
 )

@@ -58,11 +58,18 @@ def test_it_ends_after_the_round_in_which_the_work_was_done(searched):
     assert found.effects == loop.effects[:1]
     assert not found.complete
     assert not found.certain
+    assert not found.final.at_floor
     # What the last round ranks tells what might be missing.
     assert found.rounds[-1].ranking
     # Of structures that nobody looked for there are no probabilities.
     assert found.structures is None
     assert loop.structures is not None
+
+
+def test_a_first_round_is_always_looked_at(searched):
+    roles, loop, _ = searched
+    found = closed(roles, most_work=1.0)
+    assert found.effects == loop.effects[:1]
 
 
 def test_a_search_that_ends_by_itself_is_complete_whatever_its_work(searched):
@@ -86,15 +93,32 @@ def test_without_the_limit_it_goes_on_to_the_same_end(searched):
     reached = []
     closed(roles, most_work=work_of(kept[1]) - 1.0, keep=reached.append)
     known = cloudpickle.loads(cloudpickle.dumps(reached[-1]))
-    assert known.finished
+    assert not known.finished, "what was on trial is judged for the result alone"
     again = closed(roles, known=known)
     assert again.complete
     assert again.effects == loop.effects
-    assert ENDED not in [item.reason for item in again.rounds]
-    np.testing.assert_allclose(again.final.fit.point.theta, loop.final.fit.point.theta, rtol=1e-6)
+    assert [item.reason for item in again.rounds] == [item.reason for item in loop.rounds]
+    np.testing.assert_array_equal(again.final.fit.point.theta, loop.final.fit.point.theta)
 
 
 def test_it_ends_as_quickly_when_it_is_resumed(searched):
     roles, _, kept = searched
-    found = closed(roles, known=replace(kept[1]), most_work=work_of(kept[1]) - 1.0)
+    found = closed(roles, known=kept[1], most_work=work_of(kept[1]) - 1.0)
     assert [item.reason for item in found.rounds][1:] == [ENDED]
+
+
+def test_an_effect_on_trial_waits_for_the_one_that_it_was_added_for(searched):
+    """The pair was confirmed together; either alone was not."""
+    roles, loop, kept = searched
+    first = replace(kept[1].rounds[0], on_trial=True)
+    found = closed(roles, known=replace(kept[1], rounds=(first,)), most_work=1.0)
+    assert found.effects == loop.effects
+    assert found.complete
+
+
+def test_most_effects_are_a_reason_of_their_own(searched):
+    roles, loop, _ = searched
+    found = closed(roles, most_work=1.0, max_effects=1)
+    assert found.rounds[-1].reason.startswith("the largest allowed number of effects")
+    assert found.complete
+    assert found.effects == loop.effects[:1]

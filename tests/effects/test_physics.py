@@ -218,6 +218,21 @@ def test_a_lag_of_an_input_and_of_the_output_are_one(scales, channel):
     assert left.max() < 1.05 * lag**3 / 6
 
 
+def test_a_gain_reaches_all_that_a_lag_brings(scales):
+    """A sensor that lags and amplifies: every derivative is divided."""
+    model = Model(
+        "force law",
+        inputs={"position": "m"},
+        parameters={"mass": Parameter(1.0, "kg", sd=1.0)},
+        outputs={"force": "mass*ddot(position)"},
+    )
+    late = find_effect("sensor_lag").extend(model, "position", scales).model
+    both = find_effect("sensor_gain").extend(late, "position", scales).model
+    gain = symbol("sensor_gain_position")
+    expected = late.output("force") / (1 + gain)
+    assert sp.simplify(both.output("force") - expected) == 0
+
+
 def test_a_lag_takes_a_temperature_back_by_its_balance(scales):
     """Of a first-order state that answers a sine the third order in the lag is left."""
     model = Model(

@@ -453,3 +453,27 @@ def test_every_kind_of_path_is_taken(campaign, tmp_path, kind):
     out = tmp_path / "Ergebnisse µ – 測定"
     workflow.estimate(campaign, damper(), SETTINGS, out=kind(str(out)))
     assert read_tree(out / "results.nc").attrs[schema.MODEL] == "damper"
+
+
+def test_a_longer_search_goes_on_where_a_quick_one_ended(tmp_path, monkeypatch):
+    """By the same command without ``--quick``."""
+
+    def with_two(x, v, _):
+        return 1000.0 * x + 200.0 * v + 2.0e6 * x**3 + 5.0 * np.sign(v) + 4.0
+
+    without_draws(monkeypatch)
+    monkeypatch.setattr(closing, "QUICK", 1.0)
+    damper_campaign(tmp_path / "campaign", with_two)
+    settings = replace(SETTINGS, effects=(*EFFECTS, find_effect("constant_force")))
+    out, told = tmp_path / "out", []
+    tree = workflow.close(tmp_path / "campaign", damper(), settings, out=out)
+    quick = json.loads(tree.attrs[schema.SUMMARY])
+    assert len(quick["effects"]) == 1
+    assert "structures" not in quick or quick["structures"] is None
+    assert "The quick search ended there" in read_back(out)[1]
+    longer = replace(settings, quick=False)
+    tree = workflow.close(tmp_path / "campaign", damper(), longer, out=out, callback=told.append)
+    assert any(text.startswith("go on after round 1") for text in told)
+    found = json.loads(tree.attrs[schema.SUMMARY])
+    assert set(found["effects"]) == {"coulomb_friction", "constant_force"}
+    assert not (out / "checkpoints" / "search.pickle").exists()
