@@ -412,6 +412,9 @@ def period_search(values: Array, time_step: float, nominal: float) -> PeriodSear
 #: Correlation of a record with itself, a period later, that counts as periodic; how nearly the
 #: best a shorter period has to be; and the ratio of sizes, of one half to the other, of a decay.
 _REPEATS, _NEARLY, _DECAY = 0.8, 0.97, 1.1
+#: Correlation with itself, a sample or more later, below which a channel without its drift is noise
+#: alone, in large records and in standard errors of small ones.
+_SILENT, _SILENT_ERRORS = 0.3, 5.0
 #: Samples that a frequency is guessed from, at most and at least.
 _LOOKED_AT, _LEAST = 200_000, 80
 
@@ -420,7 +423,8 @@ def guess_frequency(values: Array, seconds: Array) -> float | None:
     """Frequency at which all channels repeat, Hz; None for a transient.
 
     The shortest lag is taken at which the channels, each correlated with itself, are about as much
-    alike as they are at any lag up to half the record.
+    alike as they are at any lag up to half the record. Channels that only drift, such as a
+    temperature that is logged beside the others, tell nothing.
 
     Parameters
     ----------
@@ -433,7 +437,10 @@ def guess_frequency(values: Array, seconds: Array) -> float | None:
     step = float(np.nanmedian(np.diff(seconds)))
     if count < _LEAST or not step > 0:
         return None
-    alike = np.mean([_likeness(one) for one in values], axis=0)
+    telling = [one for one in values if not _only_drifts(one)]
+    if not telling:
+        return None
+    alike = np.mean([_likeness(one) for one in telling], axis=0)
     below = np.flatnonzero(alike < 0.3)
     if not below.size:
         return None
@@ -445,9 +452,17 @@ def guess_frequency(values: Array, seconds: Array) -> float | None:
     lower = np.flatnonzero(alike[start:] < 0.9 * best)
     end = start + int(lower[0]) if lower.size else alike.size
     lag = start + int(np.argmax(alike[start:end]))
-    if lag < 4 or any(_grows_or_decays(one, lag) for one in values):
+    if lag < 4 or any(_grows_or_decays(one, lag) for one in telling):
         return None
     return float(f"{1.0 / (_summit(alike, lag) * step):.4g}")
+
+
+def _only_drifts(signal: Array) -> bool:
+    """Whether a channel is constant or noise but for a linear drift."""
+    time = np.linspace(-1.0, 1.0, signal.size)
+    rest = signal - np.polynomial.Polynomial.fit(time, signal, 1)(time)
+    least = max(_SILENT, _SILENT_ERRORS / np.sqrt(signal.size / 2))
+    return bool(np.abs(_likeness(rest)[1:]).max(initial=0.0) < least)
 
 
 def _grows_or_decays(signal: Array, period: int) -> bool:

@@ -168,6 +168,19 @@ def test_the_frequency_is_that_of_the_whole_motion(periods):
     assert guess_frequency(values, time) == pytest.approx(periods / 8.0, rel=0.01)
 
 
+@pytest.mark.parametrize("drift", [0.0, 0.3, 5.0])
+def test_a_channel_that_only_drifts_does_not_hide_the_period(drift):
+    """A temperature is logged beside the others: noise about a slow rise."""
+    rng, time = np.random.default_rng(4), np.arange(2400) / 200.0
+    wave = np.sin(2 * np.pi * 1.5 * time) + 0.01 * rng.normal(size=time.size)
+    rise = 24.0 + drift * time / 12.0 + 0.05 * rng.normal(size=time.size)
+    assert guess_frequency(np.stack([wave, rise]), time) == pytest.approx(1.5, rel=1e-3)
+    assert guess_frequency(rise[None], time) is None
+    # What moves and does not repeat makes a transient of all.
+    decay = np.exp(-time / 4.0) * np.cos(2 * np.pi * 4.0 * time)
+    assert guess_frequency(np.stack([wave, decay, rise]), time) is None
+
+
 def test_noise_and_chirps_do_not_repeat():
     time = np.arange(4000) / 500
     rng = np.random.default_rng(4)
