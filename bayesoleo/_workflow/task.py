@@ -20,7 +20,7 @@ import xarray as xr
 from bayesoleo import _schema as schema
 from bayesoleo._compiled import is_compiled
 from bayesoleo._parallel import available_cores, thread_limit
-from bayesoleo._units import parse_unit, same_quantity
+from bayesoleo._units import base_unit, parse_unit, same_quantity
 from bayesoleo._worker_processes import begin_elsewhere
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.data._campaign import CampaignData, load_campaign
@@ -45,6 +45,7 @@ from bayesoleo.estimation._nuisance import declared_nuisance
 from bayesoleo.model._derivatives import derive
 from bayesoleo.model._dimensions import check_dimensions
 from bayesoleo.model._drive_and_start import driven_by, possible_drives
+from bayesoleo.model._expressions import symbol
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._input_bandwidth import Invented, Lost, lost_inputs, without_invented
 from bayesoleo.prediction._mesh_steps import first_steps
@@ -373,8 +374,9 @@ def prepare(
             hint="give at least one a prior (sd=…, relative_sd=…, bounds=…) without fixed=True",
         )
     _check_units(driven, reduced.campaign)
+    _check_held(driven, reduced)
     reduced = within_bands(reduced, driven)
-    for sentence in stepped_inputs(reduced, driven):
+    for sentence in (*stepped_inputs(reduced, driven), *velocities_without_place(driven)):
         warnings.warn(sentence, DataWarning, stacklevel=2)
     return Task(reduced, assign(reduced.records), assembly, settings)
 
@@ -414,6 +416,27 @@ def stepped_inputs(reduced: ReducedCampaign, model: Model) -> list[str]:
             f" {half:.3g} s, half a sample, and a lag of that size would be found"
         )
     return found
+
+
+def velocities_without_place(model: Model) -> list[str]:
+    """Sentences on dofs of first order that are velocities.
+
+    A dof of first order is taken for a store (see ``effects/_places.py``). What follows a velocity,
+    such as friction, is then sought nowhere, and may be said to lie outside the catalogue.
+
+    Parameters
+    ----------
+    model : Model
+        In the drive in which it is solved.
+    """
+    rates = {base_unit("m/s"), base_unit("rad/s")}
+    return [
+        f"dof {name}, in {dof.unit}, is a velocity of first order: no friction is looked for"
+        " there, and what it does may be said to lie outside the catalogue. Declare its place as"
+        " the dof instead, of second order"
+        for name, dof in model.dofs.items()
+        if model.order(name) == 1 and dof.unit and base_unit(dof.unit) in rates
+    ]
 
 
 def within_bands(reduced: ReducedCampaign, model: Model) -> ReducedCampaign:
@@ -526,6 +549,26 @@ def _check_units(model: Model, campaign: CampaignData) -> None:
                 key=f"channels.{name}.unit",
                 value=channel.unit,
                 hint=f"write a unit that converts to {unit}, or declare the model otherwise",
+            )
+
+
+def _check_held(model: Model, reduced: ReducedCampaign) -> None:
+    """A dof that nothing holds has no place that a periodic motion returns to."""
+    periodic = [record.label for record in reduced.records if record.periodic]
+    if not periodic:
+        return
+    expressions = [*map(model.equation, model.dofs), *map(model.output, model.outputs)]
+    for dof in model.dofs:
+        if not any(model.expand(one).has(symbol(dof)) for one in expressions):
+            raise ModelError(
+                f"model {model.name!r}: nothing holds {dof!r}. Only its derivatives are in"
+                " equations and outputs, so that its place is unknown in a periodic run such as"
+                f" {periodic[0]}",
+                key="dofs",
+                value=dof,
+                hint="declare all runs as transients (kind = 'transient') that begin at"
+                f" Dof({model.dofs[dof].unit!r}, initial='0'); or its rate as a dof of first order,"
+                " at which no friction is looked for",
             )
 
 

@@ -10,9 +10,9 @@ from small_campaigns import damper, damper_campaign
 
 from bayesoleo import Campaign, _workflow as workflow
 from bayesoleo._workflow.settings import Settings
-from bayesoleo._workflow.task import StartCheck, about_start
+from bayesoleo._workflow.task import StartCheck, about_start, velocities_without_place
 from bayesoleo.data import CampaignData
-from bayesoleo.errors import DataWarning
+from bayesoleo.errors import DataWarning, ModelError
 from bayesoleo.model import Model, Output, Parameter
 from bayesoleo.prediction import RunPlan, motion
 from bayesoleo.systems import system
@@ -119,3 +119,44 @@ def test_degrees_celsius_in_a_model_are_told(tmp_path, rest, told_):
     found = [text for text in warned if "degC" in text]
     assert len(found) == told_
     assert all("temperature lies 27" in text and "in K" in text for text in found)
+
+
+def rotor(held: str = "") -> Model:
+    """A body that turns, held by nothing but what is given."""
+    return Model(
+        "rotor",
+        inputs={"displacement": "m"},
+        dofs={"place": "m"},
+        parameters={
+            "drag": Parameter(1.0, "1/s", relative_sd=0.5),
+            "pull": Parameter(4.0, "1/s**2", relative_sd=0.5),
+        },
+        equations={"place": f"ddot(place) + drag*dot(place) {held} - pull*displacement"},
+        outputs={"force": Output("1000*dot(place)", "N")},
+    )
+
+
+def test_a_dof_that_nothing_holds_is_refused_in_periodic_runs(campaign, tmp_path):
+    """Only its rate is determined: the linearised equations of any motion would be singular."""
+    with pytest.raises(ModelError, match=r"nothing holds 'place'.*periodic run such as a.*initial"):
+        workflow.check(campaign, rotor(), Settings(jobs=1))
+    workflow.check(campaign, rotor("+ pull*place"), Settings(jobs=1))
+    transient = damper_campaign(tmp_path, transient=True).campaign
+    workflow.check(transient, rotor(), Settings(jobs=1))
+
+
+@pytest.mark.parametrize(
+    ("unit", "told"), [("m/s", 1), ("rad/s", 1), ("V", 0), ("1/s", 0), ("", 0)]
+)
+def test_friction_is_not_looked_for_at_a_velocity_without_place(unit, told):
+    model = Model(
+        "motor",
+        inputs={"torque": "N*m"},
+        dofs={"speed": unit},
+        parameters={"inertia": Parameter(1.0, "", relative_sd=0.5)},
+        equations={"speed": {"inertia": "inertia*dot(speed)", "drive": "-torque"}},
+        outputs={"shown": Output("speed", unit)},
+    )
+    found = velocities_without_place(model)
+    assert len(found) == told
+    assert all("dof speed" in text and "no friction" in text for text in found)
