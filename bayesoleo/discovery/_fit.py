@@ -624,7 +624,7 @@ def for_sampling(fit: ModelFit, effective: Array | None = None) -> ModelFit:
     if fit.numerics.steps is not None or not fit.model.dofs:
         return fit
     counts = np.maximum(fit.problem.counts, 1)
-    told = 1.0 if effective is None else float(np.max(effective / counts))
+    told = 1.0 if effective is None else float(np.max(np.maximum(effective, 1.0) / counts))
     most, unseen = SAMPLED * fit.policy.mesh_shift / np.sqrt(told), fit.policy.unseen / told
     found = _on_fewest_steps(fit, lambda shift, squares: shift <= most and squares <= unseen)
     # What an error model was told of this estimate holds on fewer steps too.

@@ -147,6 +147,8 @@ def test_a_wider_posterior_is_sampled_on_fewer_steps(fit: ModelFit) -> None:
     assert steps[0] == for_sampling(fit).steps
     assert steps == sorted(steps, reverse=True)
     assert steps[-1] < steps[0]
+    with np.errstate(all="raise"):  # one sample counts at least
+        assert for_sampling(fit, 0.0 * fit.problem.counts).steps <= steps[-2]
 
 
 def test_what_an_error_model_was_told_is_known_on_fewer_steps(fit: ModelFit) -> None:
