@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bayesoleo._cli import main
+from bayesoleo._cli import run
 
 if __name__ == "__main__":
-    main()
+    run()

@@ -5,9 +5,10 @@ Commands import what they need when they run, so that ``--help`` comes at once.
 
 from __future__ import annotations
 
+import atexit
 import os
 import sys
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -15,7 +16,10 @@ from bayesoleo._cli import assessing, closing, listing, records, steps
 from bayesoleo._cli.shell import UNUSABLE, Commands, complain, flowing, machine_text
 from bayesoleo._parallel import ONE_THREAD
 
-__all__ = ["app", "main"]
+__all__ = ["app", "main", "run"]
+
+#: Exit status where nobody read to the end what was printed; Python's own.
+UNREAD = 120
 
 app = typer.Typer(
     name="bayesoleo",
@@ -95,3 +99,30 @@ def main() -> None:
             raise
         complain(f"error: {text}")
         sys.exit(UNUSABLE)
+
+
+def run() -> NoReturn:
+    """:func:`main` in a process of its own, which ends with it.
+
+    Python would take a second or two to clear away the objects of a large result one by one, while
+    the user waits for a prompt. Files are written by then, and other processes are told.
+
+    Raises
+    ------
+    SystemExit
+        Only with a message, which Python prints.
+    """
+    status = 0
+    try:
+        main()
+    except SystemExit as ended:
+        if isinstance(ended.code, str):
+            raise
+        status = ended.code or 0
+    atexit._run_exitfuncs()
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        try:
+            stream.flush()
+        except (OSError, ValueError):  # nobody reads any more
+            status = status or UNREAD
+    os._exit(status)

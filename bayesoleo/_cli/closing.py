@@ -263,8 +263,10 @@ def demo(
     """
     from bayesoleo._workflow.model_files import load_model
     from bayesoleo._workflow.simulating import demo_campaign
+    from bayesoleo.discovery._compile_ahead import begin_compiling
 
     shell.check_writable(out)
+    begin_compiling(chosen.jobs, simulated=True)
     chosen = replace(chosen, quick=not full)
     with shell.stoppable(out, quiet) as told:
         told["callback"]("simulating a shaker campaign of an oleo")

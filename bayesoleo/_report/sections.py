@@ -38,6 +38,8 @@ from bayesoleo.plots._style import Scale, engineering
 
 LARGEST_SVG = 300_000
 """Bytes above which a figure is stored as pixels instead; a page stays below some megabytes."""
+MOST_PANELS = 64
+"""Panels beyond which it is too large in any case, such as those of a posterior's many pairs."""
 DPI = 130
 FORMULA_SIZE = 12.0
 
@@ -67,9 +69,10 @@ def encode_figure(figure: Figure) -> Image:
         The same bytes for the same figure: no date, no random ids.
     """
     width, height = (72.0 * side for side in figure.get_size_inches())
-    svg = _short(_save(figure, "svg", metadata={"Date": None, "Creator": None}))
-    if len(svg) <= LARGEST_SVG:
-        return Image(_uri("image/svg+xml", svg), width, height)
+    if len(figure.axes) <= MOST_PANELS:
+        svg = _short(_save(figure, "svg", metadata={"Date": None, "Creator": None}))
+        if len(svg) <= LARGEST_SVG:
+            return Image(_uri("image/svg+xml", svg), width, height)
     return Image(_uri("image/png", _save(figure, "png", dpi=DPI)), width, height)
 
 

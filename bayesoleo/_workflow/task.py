@@ -18,10 +18,7 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import _schema as schema
-from bayesoleo._compiled import is_compiled
-from bayesoleo._parallel import available_cores, thread_limit
 from bayesoleo._units import base_unit, parse_unit, same_quantity
-from bayesoleo._worker_processes import begin_elsewhere
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.data._campaign import CampaignData, load_campaign
 from bayesoleo.data._data_warnings import data_warnings, frequency_warnings
@@ -39,6 +36,7 @@ from bayesoleo.data._frequency_response import (
 from bayesoleo.data._held_inputs import count_steps
 from bayesoleo.data._reduction import ReducedCampaign, reduce_campaign
 from bayesoleo.discovery._assembly import Assembly, Roles, assign
+from bayesoleo.discovery._compile_ahead import begin_compiling
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.errors import CampaignError, DataWarning, InputError, ModelError
 from bayesoleo.estimation._nuisance import declared_nuisance
@@ -51,7 +49,6 @@ from bayesoleo.prediction._input_bandwidth import Invented, Lost, lost_inputs, w
 from bayesoleo.prediction._mesh_steps import first_steps
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
-from bayesoleo.solvers._collocation import linear
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._schemes import COLLOCATION
 
@@ -355,7 +352,7 @@ def prepare(
     InputError
         If the campaign lacks a channel or a condition of the model, or the drive has no inverse.
     """
-    _compile_ahead(settings.jobs)
+    begin_compiling(settings.jobs)
     model = settings.inference.declare(check_dimensions(model))
     reduced = reduce(campaign, jobs=settings.jobs, progress=progress)
     drive = choose_drive(model, reduced.campaign, settings.drive)
@@ -379,12 +376,6 @@ def prepare(
     for sentence in (*stepped_inputs(reduced, driven), *velocities_without_place(driven)):
         warnings.warn(sentence, DataWarning, stacklevel=2)
     return Task(reduced, assign(reduced.records), assembly, settings)
-
-
-def _compile_ahead(jobs: int | None) -> None:
-    """Begin in another process with what has to be compiled, where nothing is yet."""
-    if min(thread_limit(), jobs or available_cores()) > 1 and not is_compiled(linear):
-        begin_elsewhere("bayesoleo.discovery._compile_ahead", "compile_ahead")
 
 
 def stepped_inputs(reduced: ReducedCampaign, model: Model) -> list[str]:

@@ -49,6 +49,8 @@ MISSES = 0.15
 #: Draws that are handed on at least, where each one costs a factorisation for each run, and by
 #: quick runs.
 ENOUGH, ENOUGH_QUICK = 4_000, 1_000
+#: What it costs to predict and to store with a draw, in evaluations of the density.
+COSTS = 3
 
 
 @dataclass(frozen=True)
@@ -418,18 +420,28 @@ def _quality(kept: list[Segment], group: Ensembles) -> Quality:
     )
 
 
-def _every(group: Ensembles, quality: Quality, draws: int, quick: bool) -> int:
-    """Of how many draws one is handed on; all are, unless each one costs a factorisation a run, or
-    the run is quick: every draw that is handed on is solved for once more."""
+def _every(group: Ensembles, quality: Quality, chains: int, draws: int, quick: bool) -> int:
+    """Of how many draws of a chain one is handed on; all are, unless each one costs a factorisation
+    a run, or the run is quick: every draw that is handed on is solved for once more."""
     errors = getattr(group.log_density, "errors", None)
     if quick:
         # An autocorrelation time loses a quarter of the information on the quantity that moves
-        # most quickly, and less on the others.
-        return int(max(1, min(draws // ENOUGH_QUICK, quality.times.min())))
+        # most quickly, and less on the others. Where all draws are nearly independent, enough are
+        # left: one costs as much to hand on as three to draw.
+        most = draws // -(-ENOUGH_QUICK // chains)
+        return int(max(1, min(most, max(COSTS, quality.times.min()))))
     if errors is None or not errors.over_runs:
         return 1
     # A quarter of the autocorrelation time loses a hundredth of the information at most.
-    return int(max(1, min(draws // ENOUGH, quality.times.min() / 4)))
+    return int(max(1, min(chains * draws // ENOUGH, quality.times.min() / 4)))
+
+
+def _sizes_of_every(quality: Quality, every: int) -> Array:
+    """Effective sizes, shape (m,), of every so many draws of chains whose correlation falls as a
+    power of the distance."""
+    correlation = np.clip((quality.times - 1) / (quality.times + 1), 0.0, 1.0)
+    apart = (1 + correlation**every) / np.maximum(1 - correlation**every, 1e-300)
+    return np.minimum(quality.sizes, quality.sizes * quality.times / (every * apart))
 
 
 def _samples(
@@ -437,7 +449,7 @@ def _samples(
 ) -> Samples:
     kept = [s for s in segments if s.phase == "kept"]
     coords = np.concatenate([s.coords for s in kept]).swapaxes(0, 1)
-    every = _every(group, quality, coords.shape[0] * coords.shape[1], quick)
+    every = _every(group, quality, coords.shape[0], coords.shape[1], quick)
     # The last draw of each few, with what failed on the way to all of them.
     first = np.arange(coords.shape[1] % every, coords.shape[1], every)
     last = first + every - 1
@@ -459,7 +471,7 @@ def _samples(
         start=group.log_density.natural(segments[0].coords[0]),
         mixture=kept[-1].mixture,
         autocorrelation_time=quality.times,
-        effective_size=quality.sizes,
+        effective_size=_sizes_of_every(quality, every),
         rhat_nested=quality.rhat,
         acceptance=acceptance,
         evaluations=sum(s.evaluations for s in segments),

@@ -55,6 +55,47 @@ def test_too_small_a_limit_of_memory_is_named_before_libraries_meet_it():
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize(("how", "status"), [("", 0), ("sys.exit()", 0), ("sys.exit(2)", 2)])
+def test_the_process_ends_with_its_status_and_all_that_it_printed(how, status):
+    code = (
+        "import atexit, sys; import bayesoleo._cli as cli\n"
+        "atexit.register(lambda: print('at the end'))\n"
+        f"def main():\n    print('x' * 100_000)\n    {how or 'pass'}\n"
+        "cli.main = main; cli.run()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (status, "")
+    assert done.stdout == "x" * 100_000 + "\nat the end\n"
+
+
+@pytest.mark.parametrize(
+    ("how", "status", "told"),
+    [("sys.exit('a message')", 1, "a message"), ("raise ValueError('mistake')", 1, "ValueError")],
+)
+def test_what_python_has_to_say_at_the_end_is_said(how, status, told):
+    code = (
+        f"import sys; import bayesoleo._cli as cli\ndef main(): {how}\ncli.main = main; cli.run()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == status
+    assert told in done.stderr
+
+
+def test_what_nobody_reads_is_no_traceback():
+    code = "import bayesoleo._cli as cli\ndef main(): print('x')\ncli.main = main; cli.run()"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"},
+    )
+    process.stdout.close()  # before the child has loaded anything
+    assert process.stderr.read() == ""
+    process.stderr.close()
+    assert process.wait() == _cli.UNREAD
+
+
 def test_a_library_without_room_before_a_command_begins_is_named(monkeypatch, capsys):
     def full():
         raise ImportError("x.so: failed to map segment from shared object")

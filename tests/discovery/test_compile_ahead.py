@@ -1,13 +1,22 @@
-"""What is compiled ahead is what a comparison of structures calls, with the same types."""
+"""What is compiled ahead, in another process, is what is called later, with the same types."""
 
 from __future__ import annotations
+
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
-from bayesoleo.discovery import _structure_evidence as evidence, _structure_moments as moments
+from bayesoleo.discovery import (
+    _compile_ahead as ahead,
+    _structure_evidence as evidence,
+    _structure_moments as moments,
+)
 from bayesoleo.discovery._structure_columns import Group, Likelihood, Reduced
 
+EVIDENCE = ("_structure_moments", "singles"), ("_structure_moments", "pairs")
 COMPILED = (evidence.singles, evidence.pairs, evidence.beside, moments._over)
 
 
@@ -34,3 +43,36 @@ def test_a_comparison_needs_nothing_that_was_not_compiled_ahead():
         for own in (one, part.with_effects(groups, [0.2, 1.0, 1.0])):
             own.log_moment(likelihood)
     assert signatures() == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("function", "compiled"),
+    [
+        ("compile_ahead", [("_collocation", "linear"), *EVIDENCE]),
+        ("compile_after_simulation", [("_periodic_newton", "solve_lanes"), *EVIDENCE]),
+    ],
+)
+def test_another_process_finds_compiled_what_it_needs_next(tmp_path, function, compiled):
+    code = f"import bayesoleo.discovery._compile_ahead as m; m.{function}()"
+    folders = {"NUMBA_CACHE_DIR": str(tmp_path / "numba"), "BAYESOLEO_CACHE": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, **folders})
+    found = {file.name for file in tmp_path.rglob("*.nbi")}
+    for module, name in compiled:
+        assert any(file.startswith(f"{module}.{name}-") for file in found), name
+
+
+@pytest.mark.parametrize(
+    ("jobs", "compiled", "begun"),
+    [(2, False, True), (2, True, False), (1, False, False)],
+)
+@pytest.mark.parametrize("simulated", [True, False])
+def test_it_is_begun_where_it_helps(monkeypatch, jobs, compiled, begun, simulated):
+    asked = []
+    monkeypatch.setattr(ahead, "begin_elsewhere", lambda *call: asked.append(call))
+    monkeypatch.setattr(ahead, "is_compiled", lambda _: compiled)
+    monkeypatch.setattr(ahead, "thread_limit", lambda: 2)
+    ahead.begin_compiling(jobs, simulated=simulated)
+    assert len(asked) == begun
+    for module, name in asked:
+        assert callable(getattr(sys.modules[module], name))

@@ -163,6 +163,30 @@ def test_a_quick_run_hands_on_draws_that_tell_something_new():
     within_error(few, np.zeros(8), sd)
 
 
+@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.9])
+@pytest.mark.parametrize("every", [1, 3, 10])
+def test_the_effective_size_of_every_few_draws_is_that_of_their_correlation(correlation, every):
+    """An autoregression of first order, whose thinned chain is one too."""
+    time = (1 + correlation) / (1 - correlation)
+    quality = _sampler.Quality(np.array([time]), np.array([6000 / time]), np.ones(1), 100)
+    thinned = (1 + correlation**every) / (1 - correlation**every)
+    exact = 6000 / every / thinned
+    assert _sampler._sizes_of_every(quality, every) == pytest.approx(exact, rel=1e-12)
+
+
+def test_a_quick_run_hands_on_enough_of_draws_that_are_nearly_independent():
+    sd = np.ones(3)
+    few = sample(Gaussian(sd), normal_mixture(sd), seed=1, quick=True, progress=False, climbs=0)
+    chains, draws, _ = few.draws.shape
+    assert few.autocorrelation_time.max() < 3
+    assert 1000 <= chains * draws < 2000 <= few.evaluations
+    own = effective_size(few.draws)
+    # Scatter of an estimate from chains of about ten draws.
+    assert own.min() > 0.6 * few.effective_size.min()
+    assert few.effective_size.max() <= 1.05 * chains * draws
+    within_error(few, np.zeros(3), sd)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("quick", [True, False])
 def test_no_walker_is_left_at_the_tip_of_a_bent_ridge(quick):
