@@ -28,7 +28,8 @@ from bayesoleo._workflow.output import (
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import Source, Task, prepare, silent
 from bayesoleo.discovery._assembly import Assembly
-from bayesoleo.discovery._fit import ModelFit, fit_model, for_sampling
+from bayesoleo.discovery._fewest_steps import for_sampling
+from bayesoleo.discovery._fit import ModelFit, fit_model
 from bayesoleo.discovery._inference import (
     CATALOGUE,
     Inference,

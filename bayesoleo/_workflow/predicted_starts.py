@@ -15,7 +15,7 @@ import numpy as np
 
 from bayesoleo._types import Array, Integers
 from bayesoleo.discovery._beginnings import LIMITS, UNSEEN, on_beginning
-from bayesoleo.discovery._fit import weights
+from bayesoleo.discovery._samples_that_count import weights
 from bayesoleo.discovery._transient_variance import RunNoise, coloured_variance
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._estimate import estimate

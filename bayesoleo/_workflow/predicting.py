@@ -31,10 +31,10 @@ from bayesoleo.data._disturbances import without_disturbances
 from bayesoleo.data._noise import local_means
 from bayesoleo.data._reduction import ReducedCampaign
 from bayesoleo.discovery._expected_error import most_by_chance
-from bayesoleo.discovery._fit import weights
 from bayesoleo.discovery._fit_and_hold_out_error import compared
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._run_predictions import Prediction
+from bayesoleo.discovery._samples_that_count import weights
 from bayesoleo.errors import InputError, check_level
 from bayesoleo.estimation._baselines import (
     Baseline,

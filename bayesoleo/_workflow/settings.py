@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, cast
 from bayesoleo.errors import InputError, choose
 
 if TYPE_CHECKING:
-    from bayesoleo.discovery._fit import Numerics
     from bayesoleo.discovery._inference import Inference
+    from bayesoleo.discovery._numerics import Numerics
     from bayesoleo.discovery._policy import SearchPolicy
     from bayesoleo.discovery._structures import StructurePrior
     from bayesoleo.effects._effect import Effect
@@ -443,7 +443,7 @@ class Settings:
     @property
     def numerics(self) -> Numerics:
         """How models are solved."""
-        from bayesoleo.discovery._fit import Numerics
+        from bayesoleo.discovery._numerics import Numerics
 
         return Numerics(
             self.scheme,

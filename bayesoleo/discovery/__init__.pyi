@@ -11,7 +11,6 @@ from ._expected_error import (
 )
 from ._fit import (
     ModelFit as ModelFit,
-    Numerics as Numerics,
     fit_model as fit_model,
 )
 from ._fit_and_hold_out_error import (
@@ -28,6 +27,9 @@ from ._loop import (
 from ._nonparametric_search import (
     CurveSearch as CurveSearch,
     Tried as Tried,
+)
+from ._numerics import (
+    Numerics as Numerics,
 )
 from ._policy import (
     SearchPolicy as SearchPolicy,

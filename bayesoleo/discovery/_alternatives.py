@@ -23,7 +23,7 @@ import numpy as np
 
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import AddedEffect, Roles
-from bayesoleo.discovery._fit import ModelFit, Numerics
+from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._fit_difference import noise_between
 from bayesoleo.discovery._hold_out_confirmation import (
     confirmed,
@@ -34,6 +34,7 @@ from bayesoleo.discovery._hold_out_confirmation import (
     lacks_input,
     with_error,
 )
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import ABSORBING_FAMILIES, Ranked, score_candidates
 from bayesoleo.discovery._refit import (

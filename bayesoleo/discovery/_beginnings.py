@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from bayesoleo._types import Array
-from bayesoleo.discovery._fit import RESOLUTION, weights
+from bayesoleo.discovery._fit import RESOLUTION
+from bayesoleo.discovery._samples_that_count import weights
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._problem import Evaluation
 from bayesoleo.prediction._predictor import Predictor

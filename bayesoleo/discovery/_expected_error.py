@@ -34,10 +34,11 @@ from scipy import stats
 
 from bayesoleo._types import Array
 from bayesoleo.data._noise import local_means
-from bayesoleo.discovery._fit import ModelFit, weights
+from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._fit_and_hold_out_error import RunError
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._run_predictions import Prediction
+from bayesoleo.discovery._samples_that_count import weights
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.prediction._records import Record
 from bayesoleo.solvers._orbit import Status

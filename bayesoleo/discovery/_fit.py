@@ -1,11 +1,6 @@
-"""Fits of an assembled model to runs, with masks and checks from other starts.
+"""Fits of an assembled model to runs.
 
-A fit is the MBE, then the posterior mode, on a mesh fine enough not to influence them. Masked
-samples have no weight; they are interpolated where whole periods are needed.
-
-The equations of several resonances or contacts have several solutions, and the nominal values may
-lie next to a wrong one. A wrong solution usually lies at a limit of a prior's support, or where the
-priors have almost no mass. Only then is the time for other starts well spent.
+A fit is the MBE, then the posterior mode, on a mesh fine enough not to influence them.
 """
 
 from __future__ import annotations
@@ -13,20 +8,24 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from typing import cast
 
 import numpy as np
-from scipy import stats
 
-from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array
-from bayesoleo.data._noise import PeriodicAverage
-from bayesoleo.data._sample_quality import bridged
+from bayesoleo.discovery._mesh_error import (
+    UNKNOWN_MESH,
+    begin_with,
+    can_be_coarser,
+    can_be_joined,
+    mesh_shift,
+    shows,
+)
+from bayesoleo.discovery._numerics import Numerics, problem_on
+from bayesoleo.discovery._other_starts import doubtful, from_other_starts, likeliest
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.estimation._bayesian_estimators import method as step_of
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._estimate import estimate, polish
-from bayesoleo.estimation._least_squares import PriorScale
 from bayesoleo.estimation._point_estimate import PointEstimate
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._mesh_steps import (
@@ -42,11 +41,9 @@ from bayesoleo.prediction._mesh_steps import (
 )
 from bayesoleo.prediction._predictor import Predictor, RunPrediction
 from bayesoleo.prediction._records import Record
-from bayesoleo.prediction._run_errors import motion_error, outputs_of
 from bayesoleo.prediction._stability import Stability
-from bayesoleo.prediction._transient_run import SETTLED
 from bayesoleo.solvers._orbit import Status
-from bayesoleo.solvers._schemes import COLLOCATION, DEFAULT_SCHEME
+from bayesoleo.solvers._schemes import COLLOCATION
 
 #: What is said of a mesh that did not do, or of which nothing is known.
 TOO_COARSE = (
@@ -59,11 +56,6 @@ UNKNOWN_SHIFT = (
     "the error of the mesh of {} steps could not be estimated: nothing is known of what it does to"
     " the estimates"
 )
-#: Shift, error of the motion and of the outputs of a mesh of which nothing is known, and what a
-#: finer one does to the sum of squares.
-UNKNOWN_MESH = (float("nan"), float("nan"), np.full((1, 1), np.nan), float("nan"))
-#: Error of a motion over its swing below which its estimate resolves nothing more.
-RESOLVED = 1e-3
 #: An estimate ends where the optimum is nearer than this many posterior standard deviations; its
 #: iterations gain a digit each, and what is below no figure shows.
 RESOLUTION = 1e-3
@@ -74,161 +66,6 @@ COMPARED = 0.1
 #: Iterations of MBE on all steps after a mode on fewer, and of BE where that was not reached: MBE
 #: creeps where the data leave an unknown open.
 MORE = 10
-#: Starts of one estimate, each farther from the present one, that are worse than the best before
-#: the others are not looked at.
-GIVEN_UP = 2
-#: Part of the shift that the steps of an estimate may cause, for those of a density.
-SAMPLED = 0.1
-
-
-def weights(record: Record) -> Array:
-    """One for every sample that counts, zero for the others, shape (N,)."""
-    return np.ones(record.time.size) if record.kept is None else record.kept.astype(float)
-
-
-def counted(record: Record) -> int:
-    """Number of samples that count."""
-    return record.time.size if record.kept is None else int(record.kept.sum())
-
-
-def without_masked(record: Record, residual: Array) -> Array:
-    """A residual with what the other samples say where it does not count, shape (N,).
-
-    Of a periodic run that is the average over its other periods: least squares on all harmonics
-    then is that of the samples that count. Of a transient it is a straight line.
-    """
-    if record.kept is None or not np.isfinite(residual).all():
-        return residual
-    cycles = (record.time[-1] - record.time[0]) / (record.time.size - 1) * record.frequency
-    step = float(cycles) if record.periodic else None
-    return cast(Array, bridged(residual[None], ~record.kept, step)[0])
-
-
-def of_those_counted(record: Record, average: PeriodicAverage) -> PeriodicAverage:
-    """The average of a bridged residual, its noise that of the samples which count.
-
-    What was bridged lies on the average: it adds nothing to the squares, and nothing is known by
-    it.
-    """
-    if record.kept is None:
-        return average
-    count, all_ = counted(record), average.samples
-    sigma = average.sigma * np.sqrt((all_ - average.number) / (count - average.number))
-    noise = float(sigma * np.sqrt(average.number / count))
-    return replace(average, sigma=float(sigma), noise=noise, samples=count)
-
-
-def doubtful(problem: CampaignProblem, point: PointEstimate, policy: SearchPolicy) -> bool:
-    """Whether an estimate stands where its priors hardly allow it, or did not converge."""
-    if point.on_limit or not point.status.ok:
-        return True
-    scale = PriorScale.of(problem.priors, problem.names)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        away = np.where(
-            scale.logarithmic, np.log(point.theta / scale.mean), point.theta - scale.mean
-        )
-    return bool(np.any(np.abs(away / scale.spread) > stats.norm.isf(policy.doubtful_prior / 2)))
-
-
-def from_other_starts(
-    problem: CampaignProblem,
-    mbe: PointEstimate,
-    point: PointEstimate,
-    *,
-    tolerance: float,
-    max_iterations: int,
-    resolution: float,
-    policy: SearchPolicy,
-) -> tuple[PointEstimate, PointEstimate]:
-    """The best of an estimate and those from starts drawn from the priors.
-
-    The search ends with the first answer that is better and that the priors allow.
-
-    Parameters
-    ----------
-    problem : CampaignProblem
-    mbe, point : PointEstimate
-        MBE's estimate from the declared start, and the mode reached from it.
-    tolerance, max_iterations, resolution
-        As in :func:`~bayesoleo.estimation.estimate`.
-    policy : SearchPolicy
-
-    Returns
-    -------
-    mbe, point : PointEstimate
-        Those that were given, where no other start leads to a mode that is clearly more likely.
-    """
-    options = {"tolerance": tolerance, "max_iterations": max_iterations, "resolution": resolution}
-    least = policy.better_optimum
-    for start in promising(problem, problem.start, policy):
-        first = estimate(problem, "mbe", start=start, **options)  # type: ignore[arg-type]
-        if not first.status.ok:
-            continue
-        found = polish(problem, first, **options)  # type: ignore[arg-type]
-        if found.status.ok and (not point.status.ok or found.objective > point.objective + least):
-            mbe, point = first, found
-            if not doubtful(problem, point, policy):
-                break
-    return mbe, point
-
-
-def promising(problem: CampaignProblem, theta: Array, policy: SearchPolicy) -> list[Array]:
-    """The most likely of many draws from the priors.
-
-    Parameters
-    ----------
-    problem : CampaignProblem
-        Its solver starts from where it stands.
-    theta : ndarray, shape (l,)
-        Where unknowns of single runs stay.
-    policy : SearchPolicy
-        How many are drawn and kept.
-
-    Returns
-    -------
-    list of ndarray, shape (l,)
-        Those that could not be solved are left out.
-    """
-    rng, shared = np.random.default_rng(0), problem.predictor.model.parameters
-    draws = np.repeat(np.asarray(theta, dtype=float)[None], policy.prior_draws, axis=0)
-    for k, (name, prior) in enumerate(zip(problem.names, problem.priors, strict=True)):
-        if name in shared:
-            draws[:, k] = prior.sample(rng, policy.prior_draws)
-    cost = _cost(problem, draws)
-    order = np.argsort(cost)[: policy.prior_starts]
-    return [draws[k] for k in order if np.isfinite(cost[k])]
-
-
-@dataclass(frozen=True)
-class Numerics:
-    """How models are solved.
-
-    Parameters
-    ----------
-    scheme : str
-        Discretisation.
-    solver : str
-        Of periodic runs, see :func:`~bayesoleo.prediction.periodic_orbit`.
-    steps : int or None
-        Steps of the mesh; ``None`` refines until the estimate no longer moves.
-    jobs : int or None
-        Threads.
-    backend : str
-        ``numba`` or ``numpy``.
-    scheduler : str or None
-        Other processes or machines for fits that do not depend on each other: ``local:4``, or the
-        address of a Dask scheduler.
-    policy : SearchPolicy
-        By which fits are judged and compared.
-    """
-
-    scheme: str = DEFAULT_SCHEME
-    steps: int | None = None
-    jobs: int | None = None
-    backend: str = "numba"
-    scheduler: str | None = None
-    solver: str = COLLOCATION
-    policy: SearchPolicy = SearchPolicy()
 
 
 @dataclass(frozen=True)
@@ -398,7 +235,7 @@ def fit_model(
     }  # fmt: skip
     problem, few = _begun(model, records, numerics, share), max_iterations
     if check_mesh and start is not None and _has_fewer_steps(problem):
-        rough = _problem(model, records, numerics, _rough_steps(problem), share)
+        rough = problem_on(model, records, numerics, _rough_steps(problem), share)
         found = _look(rough, start, method, damped, limits, numerics.policy)
         start = start if found is None else found.theta
         few = few if found is None else min(max_iterations, MORE)
@@ -430,11 +267,11 @@ def fit_model(
         # One-step collocation gains more than a factor of four by halving, so one look ahead
         # usually suffices.
         start = start if lost else point.theta
-        share = problem.predictor if _can_be_coarser(problem) or not check_mesh else share
+        share = problem.predictor if can_be_coarser(problem) or not check_mesh else share
         before = problem.predictor
-        problem = _problem(model, records, numerics, 2 * steps, share)
+        problem = problem_on(model, records, numerics, 2 * steps, share)
         if not check_mesh:
-            _begin_with(problem.predictor, before)
+            begin_with(problem.predictor, before)
 
 
 def _has_fewer_steps(problem: CampaignProblem) -> bool:
@@ -484,7 +321,7 @@ def _estimated(
     """The estimate by a method, in a few iterations where it began with a mode, and the mode, on
     one mesh; parameters as of :func:`fit_model`."""
     several = start is not None and start.ndim == 2
-    first = _likeliest(problem, start) if start is not None and several else start
+    first = likeliest(problem, start) if start is not None and several else start
     callback(f"{method.upper()}, {len(problem.names)} unknowns, {problem.predictor.steps} steps")
     step = replace(step_of(method), damped=True) if damped else method
     most = limits if few is None else limits | {"max_iterations": few}
@@ -508,16 +345,6 @@ def _lost(mbe: PointEstimate, point: PointEstimate) -> bool:
     return not point.status.ok and bool(not ended_by_limit or mbe.failures or point.failures)
 
 
-def _can_be_coarser(problem: CampaignProblem) -> bool:
-    """Whether any run is so long that its steps may be joined."""
-    return any(run.can_be_coarser for run in problem.predictor.runs)
-
-
-def _can_be_joined(problem: CampaignProblem) -> bool:
-    """Whether a comparison may do with fewer steps than were chosen for any run."""
-    return any(run.can_be_joined for run in problem.predictor.runs)
-
-
 def _error_of_mesh(
     problem: CampaignProblem,
     point: PointEstimate,
@@ -528,7 +355,7 @@ def _error_of_mesh(
     """As :func:`_mesh_shift` gives it, if it is asked for; none where there is no mesh."""
     if not problem.predictor.model.dofs:
         return 0.0, 0.0, np.zeros((1, 1)), 0.0
-    return _mesh_shift(problem, point, predictions, numerics.policy) if check else UNKNOWN_MESH
+    return mesh_shift(problem, point, predictions, numerics.policy) if check else UNKNOWN_MESH
 
 
 def _wants_finer(
@@ -547,15 +374,15 @@ def _wants_finer(
     difference shows in what the model leaves (``seen``). Of a model that is only compared with
     others this is all that is asked, and the steps that an integrator chose are fine enough.
     """
-    steps, long = problem.predictor.steps, _can_be_coarser(problem)
+    steps, long = problem.predictor.steps, can_be_coarser(problem)
     whole = whole_steps(problem.predictor.model, problem.predictor.records)
-    fewer = steps < whole and (long or _can_be_joined(problem))
+    fewer = steps < whole and (long or can_be_joined(problem))
     if fewer and lost and (long or point.status is not Status.NO_CONVERGENCE):
         return True  # steps may be so long that no solution is found, or lost on the way
     if not check:
         # Where iterations ended the estimate, finer steps than an integrator's give it only more.
         most = MOST_COMPARED if long and point.status.ok else whole
-        return (long or fewer) and steps < most and _shows(problem, point, predictions, numerics)
+        return (long or fewer) and steps < most and shows(problem, point, predictions, numerics)
     if long and not np.isfinite(seen):
         moved = steps < WHOLE
     elif long and steps < MOST_COMPARED:
@@ -569,310 +396,7 @@ def _begun(
     """The problem on the first mesh: of long records the coarsest, since an estimate is repeated on
     finer ones until it no longer moves."""
     steps = numerics.steps or first_steps(model, records)
-    problem = _problem(model, records, numerics, steps, share)
+    problem = problem_on(model, records, numerics, steps, share)
     if numerics.steps or not all(run.can_be_coarser for run in problem.predictor.runs):
         return problem
-    return _problem(model, records, numerics, COARSEST, problem.predictor)
-
-
-def for_comparison(fit: ModelFit) -> ModelFit:
-    """A fit on the coarsest mesh that shows no difference, to score and refit candidates on.
-
-    A comparison needs no higher accuracy than what it decides on. What a coarser mesh changes of
-    the outputs, and of the sum of squares through the residual, may not be more than one variance
-    of what the model leaves, over all samples together. That holds at this estimate: an effect that
-    explains ``a`` such variances and has the same error of the mesh explains at most
-    ``2 sqrt(a) + 1`` more or less there, which is little of what is far from a limit. The estimate
-    of a candidate asks again, and is repeated on finer steps where these show.
-
-    Parameters
-    ----------
-    fit : ModelFit
-
-    Returns
-    -------
-    ModelFit
-        The same estimate; itself where no run can be solved in fewer steps.
-    """
-    if not fit.model.dofs:  # what candidates begin with
-        steps = min(fit.steps, coarsest_steps(fit.records, fit.steps))
-        long = fit.all_periodic or any(run.is_long for run in fit.predictor.runs)
-        return replace(fit, steps=steps) if long and _may_be_coarser(fit) else fit
-    return _on_fewest_steps(fit, lambda _, squares: squares <= fit.policy.unseen)
-
-
-def for_sampling(fit: ModelFit, effective: Array | None = None) -> ModelFit:
-    """A fit on the coarsest mesh that leaves the posterior where it is.
-
-    A density is computed some ten thousand times. Steps that move no parameter by a tenth of what
-    those of the estimate may, a hundredth of its standard deviation, move the posterior by less
-    than the draws of any sampler tell, and change the likelihood of the estimate by nothing that is
-    seen.
-
-    Parameters
-    ----------
-    fit : ModelFit
-    effective : ndarray, shape (N, s), optional
-        Number of samples that count, of each run and output, where the density takes its
-        likelihood to that power: what the samples tell is then less, and its deviations wider.
-
-    Returns
-    -------
-    ModelFit
-        The same estimate; itself where steps were asked for, or no run can be solved in fewer.
-    """
-    if fit.numerics.steps is not None or not fit.model.dofs:
-        return fit
-    counts = np.maximum(fit.problem.counts, 1)
-    told = 1.0 if effective is None else float(np.max(np.maximum(effective, 1.0) / counts))
-    most, unseen = SAMPLED * fit.policy.mesh_shift / np.sqrt(told), fit.policy.unseen / told
-    found = _on_fewest_steps(fit, lambda shift, squares: shift <= most and squares <= unseen)
-    # What an error model was told of this estimate holds on fewer steps too.
-    own, known = found.problem, fit.problem
-    own.signatures, own.effective, own.stretch = known.signatures, known.effective, known.stretch
-    return found
-
-
-def _may_be_coarser(fit: ModelFit) -> bool:
-    """Whether there are meshes to compare: none where runs of both kinds share one, or a solver
-    chooses its own."""
-    periodic = [record.periodic for record in fit.records]
-    return not any(periodic) or (all(periodic) and fit.numerics.solver == COLLOCATION)
-
-
-def _on_fewest_steps(fit: ModelFit, do: Callable[[float, float], bool]) -> ModelFit:
-    """A fit on the fewest steps that do, by the shift of parameters and the change of the sum of
-    squares from those that it has; itself where none do."""
-    either = _can_be_coarser(fit.problem) or _can_be_joined(fit.problem)
-    if not (_may_be_coarser(fit) and either):
-        return fit
-    theta, known = fit.point.theta, [run.y for run in fit.predictions]
-    steps = coarsest_steps(fit.records, fit.steps)
-    while steps < fit.steps:
-        problem = _problem(fit.model, fit.records, fit.numerics, steps, fit.predictor)
-        _begin_with(problem.predictor, fit.predictor)
-        if problem.freeze(theta) is Status.CONVERGED:
-            found = problem.predictor.predict(problem.full(theta[None])[0])
-            squares = _squares(problem, found, known, fit.point)
-            if do(_shift(problem, fit.point, found, known), squares):
-                return replace(fit, problem=problem, predictions=found, steps=steps)
-        steps *= 2
-    return fit
-
-
-def _begin_with(predictor: Predictor, known: Predictor) -> None:
-    """Start periodic runs from the motions of others of the same model, which are on their branch;
-    transients do so by themselves."""
-    for run, other in zip(predictor.runs, known.runs, strict=True):
-        if run.record.periodic:
-            run.motions, run.watched = other.known_motions(), other.watched
-
-
-def _shows(
-    problem: CampaignProblem,
-    point: PointEstimate,
-    predictions: list[RunPrediction],
-    numerics: Numerics,
-) -> bool:
-    """Whether half the steps would visibly change what a model leaves."""
-    if not all(run.status.ok for run in predictions):
-        return False
-    halved = _halved(problem, point)
-    if halved is None:  # where a force sets in, the solution is lost on one mesh and not on another
-        return True
-    return _squares(problem, predictions, halved, point) > numerics.policy.unseen
-
-
-def _squares(
-    problem: CampaignProblem,
-    predictions: list[RunPrediction],
-    others: list[Array],
-    point: PointEstimate,
-) -> float:
-    """Largest change of the sum of squares by better predictions, over the variances of what is
-    left: ``d.d + |2 r.d|`` of their changes ``d`` and residuals ``r``."""
-    squares, along = 0.0, 0.0
-    # An integrator's steps, and those of a period, are finer than what long ones are halved to.
-    settled = SETTLED if _can_be_coarser(problem) else 0.0
-    for record, run, here, other in zip(
-        problem.predictor.records, problem.predictor.runs, predictions, others, strict=True
-    ):
-        own = changed_squares(run.measured, here.y, other, point.variance, weights(record), settled)
-        squares, along = squares + own[0], along + own[1]
-    return squares + abs(along)
-
-
-def changed_squares(
-    measured: Array,
-    here: Array,
-    other: Array,
-    variance: Array,
-    weight: Array,
-    settled: float = SETTLED,
-) -> tuple[float, float]:
-    """``d.d`` and ``2 r.d`` of a change ``d`` of outputs to residuals ``r``, over variances.
-
-    Parameters
-    ----------
-    measured, here, other : ndarray, shape (ny, N)
-        Measured outputs, those predicted, and those that they change to.
-    variance : ndarray, shape (ny,)
-        Of what a model leaves.
-    weight : ndarray, shape (N,)
-        One for samples that count, zero for others.
-    settled : float
-        Root mean square of a change, over the size of an output, that is not seen.
-    """
-    counts = weight > 0
-    if not counts.any():
-        return 0.0, 0.0
-    measured, here, other = (values[:, counts] for values in (measured, here, other))
-    squares = np.mean((other - here) ** 2, axis=1)
-    products = np.sum((measured - other) * (other - here), axis=1)
-    shown = products * _is_shown(measured, squares, settled)
-    along = float(np.sum(2.0 * shown / np.maximum(variance, 1e-300)))
-    return visible(measured, squares, variance, settled), along
-
-
-def visible(measured: Array, squares: Array, variance: Array, settled: float = SETTLED) -> float:
-    """Sum of squares of a change of outputs, over the variances ``(ny,)`` of what a model leaves.
-
-    Where it leaves next to nothing, what has settled shows no more.
-
-    Parameters
-    ----------
-    measured : ndarray, shape (ny, N)
-    squares : ndarray, shape (ny,)
-        Mean squares of the change.
-    variance : ndarray, shape (ny,)
-    settled : float
-        As of :func:`changed_squares`.
-    """
-    shown = squares * _is_shown(measured, squares, settled)
-    return float(np.sum(shown / np.maximum(variance, 1e-300)) * measured.shape[1])
-
-
-def _is_shown(measured: Array, squares: Array, settled: float) -> Array:
-    """One for outputs whose mean squared change ``(ny,)`` is more than what has settled, else
-    zero."""
-    return (squares > settled**2 * np.var(measured, axis=1)).astype(float)
-
-
-def _likeliest(problem: CampaignProblem, starts: Array) -> Array:
-    """Of starts ``(m, l)`` the one that makes the data most likely; the first where that cannot be
-    told.
-
-    They lead from far away to the last, where the motion is known. Those beyond a few that are
-    worse than the best so far are not looked at: a motion far from what it is solved from takes ten
-    times as long, and the farther the less likely it is.
-    """
-    if problem.freeze(starts[-1]) is not Status.CONVERGED:
-        return cast(Array, starts[0])
-    best, least, worse = 0, np.inf, 0
-    for k in reversed(range(len(starts))):
-        (cost,) = _cost(problem, starts[k : k + 1])
-        if cost < least:
-            best, least, worse = k, float(cost), 0
-        else:
-            worse += int(np.isfinite(least))
-        if worse == GIVEN_UP:
-            break
-    return cast(Array, starts[best])
-
-
-def _cost(problem: CampaignProblem, vectors: Array) -> Array:
-    """Twice the negative logarithm of the likelihood, variances eliminated, of vectors ``(L, l)``;
-    infinite for those that could not be solved.
-
-    They lie far apart: a motion of another branch is as good as any, and no jump of the estimate.
-    """
-    with problem.unwatched():
-        sums = problem.misfit(vectors).sum_of_squares.sum(axis=1)
-    counts = problem.counts.sum(axis=0)
-    cost = np.sum(counts * np.log(np.maximum(sums, 1e-300)), axis=1)
-    return np.where(np.isfinite(cost), cost, np.inf)
-
-
-def _problem(
-    model: Model, records: Sequence[Record], numerics: Numerics, steps: int, share: Predictor | None
-) -> CampaignProblem:
-    predictor = Predictor(
-        model,
-        records,
-        steps=steps,
-        scheme=numerics.scheme,
-        solver=numerics.solver,
-        backend=numerics.backend,
-        jobs=numerics.jobs,
-        share=share,
-    )
-    return CampaignProblem(predictor)
-
-
-def _mesh_shift(
-    problem: CampaignProblem,
-    point: PointEstimate,
-    predictions: list[RunPrediction],
-    policy: SearchPolicy,
-) -> tuple[float, float, Array, float]:
-    """Shift of the estimate that the discretisation causes, in standard deviations, the largest
-    error of a motion over its swing, what a finer mesh changes of each output of each run, and of
-    the sum of squares."""
-    coarse = problem.predictor
-    halved = _halved(problem, point)
-    if halved is None:
-        return UNKNOWN_MESH
-    shift = _shift(problem, point, predictions, halved)
-    found = thread_map(lambda run: motion_error(run, RESOLVED), coarse.runs, coarse.jobs)
-    error = float(np.max([one.error for one in found]))  # NaN where one is not known
-    better = [outputs_of(run, one) for run, one in zip(coarse.runs, found, strict=True)]
-    known = [y for y in better if y is not None and np.isfinite(y).all()]
-    if len(known) < len(better):
-        changes = _squares(problem, predictions, halved, point)
-        return shift, error, _change(predictions, halved), changes
-    missed = _shift(problem, point, predictions, known)
-    clearly = missed > max(policy.missed_factor * shift, policy.mesh_shift)
-    changes = _squares(problem, predictions, known, point)
-    return (missed if clearly else shift), error, _change(predictions, known), changes
-
-
-def _change(predictions: list[RunPrediction], better: list[Array]) -> Array:
-    """Root mean square of the difference, shape (runs, outputs)."""
-    pairs = zip(predictions, better, strict=True)
-    return np.array([np.sqrt(np.mean((y - run.y) ** 2, axis=1)) for run, y in pairs])
-
-
-def _halved(problem: CampaignProblem, point: PointEstimate) -> list[Array] | None:
-    """Outputs ``(ny, N)`` of every run on half the steps; None where one has no solution."""
-    coarse = problem.predictor
-    theta = problem.full(point.theta[None])[0]
-    fine = Predictor(
-        coarse.model,
-        coarse.records,
-        steps=2 * coarse.steps,
-        scheme=coarse.scheme,
-        solver=coarse.solver,
-        backend=coarse.backend,
-        jobs=coarse.jobs,
-        share=coarse,
-    )
-    _begin_with(fine, coarse)
-    found = fine.solved_anew(theta)
-    if any(samples.status[0] != Status.CONVERGED.value for samples in found):
-        return None
-    return [samples.y[0] for samples in found]
-
-
-def _shift(
-    problem: CampaignProblem,
-    point: PointEstimate,
-    predictions: list[RunPrediction],
-    better: list[Array],
-) -> float:
-    """Largest shift ``(J' W J)^-1 J' W delta`` over its standard deviation, by better outputs."""
-    names = problem.predictor.layout.names
-    gradient = np.zeros(len(names))
-    for run, y in zip(predictions, better, strict=True):
-        gradient += np.einsum("ylN,yN->l", run.sensitivity, (y - run.y) / point.variance[:, None])
-    free = np.array([names.index(name) for name in problem.names])
-    return float(np.max(np.abs(point.covariance @ gradient[free]) / point.sd, initial=0.0))
+    return problem_on(model, records, numerics, COARSEST, problem.predictor)

@@ -39,9 +39,14 @@ from bayesoleo.data._noise import (
 )
 from bayesoleo.data._sample_quality import emptied_lines, rounding_in_average
 from bayesoleo.discovery._assembly import RecordNoise
-from bayesoleo.discovery._fit import counted, of_those_counted, weights, without_masked
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._run_predictions import Prediction, borne_out, sample_noise
+from bayesoleo.discovery._samples_that_count import (
+    counted,
+    of_those_counted,
+    weights,
+    without_masked,
+)
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._run_errors import errors_known, input_columns
 

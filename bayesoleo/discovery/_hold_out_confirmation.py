@@ -19,12 +19,13 @@ from scipy import stats
 from bayesoleo._types import Array, ProgressCallback
 from bayesoleo.data._noise import NoiseSpectrum
 from bayesoleo.discovery._assembly import Roles, in_halves
-from bayesoleo.discovery._fit import Numerics, weights
 from bayesoleo.discovery._fit_and_hold_out_error import RunError
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._refit import Refit, noise_of_fit
 from bayesoleo.discovery._run_predictions import Prediction, crossed
+from bayesoleo.discovery._samples_that_count import weights
 from bayesoleo.discovery._state import State, fit_state
 from bayesoleo.discovery._transient_variance import coloured_variance, noise_along
 from bayesoleo.prediction._inputs import lacking

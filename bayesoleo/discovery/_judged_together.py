@@ -24,8 +24,8 @@ from scipy import stats
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._alternatives import Loss, compared_without, loss_of
 from bayesoleo.discovery._assembly import AddedEffect, Roles
-from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._hold_out_confirmation import Fall, fall_on_hold_out, judged
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._refit import start_from
 from bayesoleo.discovery._score_basis import Base

@@ -22,10 +22,11 @@ from bayesoleo._parallel import single_blas_thread
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._alternatives import best_of_beam, eliminated
 from bayesoleo.discovery._assembly import Added, Assembly, Roles
-from bayesoleo.discovery._fit import ModelFit, Numerics
+from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._fit_and_hold_out_error import RunError, least_noise, limit
 from bayesoleo.discovery._judged_together import TOGETHER, judged_together
 from bayesoleo.discovery._nonparametric_round import nonparametric_notes, with_nonparametric
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import ABSORBING_FAMILIES, Ranked
 from bayesoleo.discovery._review import reviewed

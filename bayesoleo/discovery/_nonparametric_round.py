@@ -20,7 +20,7 @@ from scipy import stats
 
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import AddedEffect, Roles
-from bayesoleo.discovery._fit import ModelFit, Numerics
+from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._hold_out_confirmation import (
     confirmed,
     contradicted,
@@ -29,6 +29,7 @@ from bayesoleo.discovery._hold_out_confirmation import (
 )
 from bayesoleo.discovery._nonparametric_quantities import ranges
 from bayesoleo.discovery._nonparametric_search import CurveSearch, Tried, closest, search
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import ABSORBING_FAMILIES, Ranked, scales_of
 from bayesoleo.discovery._refit import Refit, fall_from, refit

@@ -18,7 +18,6 @@ from bayesoleo import _schema as schema
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import Added
-from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._fit_and_hold_out_error import ErrorTable, error_table
 from bayesoleo.discovery._loop import SURE, ClosedLoop, scored_later
 from bayesoleo.discovery._next_experiment import (
@@ -31,6 +30,7 @@ from bayesoleo.discovery._next_experiment import (
     limits_of,
     propose_runs,
 )
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._predicted_experiment import Range, Rival, sizes_of
 from bayesoleo.discovery._ranking import Ranked

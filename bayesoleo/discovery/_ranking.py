@@ -20,10 +20,11 @@ from scipy import ndimage, optimize, stats
 from bayesoleo._types import Array, ProgressCallback
 from bayesoleo.data._harmonics import FALSE_ALARM
 from bayesoleo.discovery._assembly import Assembly, Option
-from bayesoleo.discovery._fit import ModelFit, weights
+from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._fit_difference import Undecided, undecided
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._refit import Refit
+from bayesoleo.discovery._samples_that_count import weights
 from bayesoleo.discovery._scanned_columns import MOST_KEPT, Scanned, size_of
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import (

@@ -16,8 +16,10 @@ from scipy import stats
 from bayesoleo._types import Array
 from bayesoleo._worker_processes import process_map
 from bayesoleo.discovery._assembly import Assembly
-from bayesoleo.discovery._fit import COMPARED, ModelFit, Numerics, fit_model, weights
+from bayesoleo.discovery._fit import COMPARED, ModelFit, fit_model
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._samples_that_count import weights
 from bayesoleo.discovery._score_basis import Base, squared_distance
 from bayesoleo.discovery._score_tests import Score, inflation_by_estimate
 from bayesoleo.discovery._transient_variance import RunNoise, coloured_variance

@@ -18,12 +18,13 @@ from bayesoleo import _schema as schema
 from bayesoleo._types import Array
 from bayesoleo.data._campaign import CampaignData
 from bayesoleo.discovery._curves import shape_group
-from bayesoleo.discovery._fit import ModelFit, weights
+from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._fit_and_hold_out_error import RunError, chance
 from bayesoleo.discovery._loop import ClosedLoop
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._round import Round
 from bayesoleo.discovery._run_predictions import Prediction, predict_fitted
+from bayesoleo.discovery._samples_that_count import weights
 from bayesoleo.discovery._state import State
 from bayesoleo.discovery._summary import in_words, titles_of
 from bayesoleo.error_models._base import ErrorModel, RunSamples

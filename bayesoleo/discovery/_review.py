@@ -18,7 +18,6 @@ from bayesoleo._types import ProgressCallback
 from bayesoleo._worker_processes import process_map
 from bayesoleo.discovery._alternatives import Loss, dispersion, eliminated, loss_without
 from bayesoleo.discovery._assembly import AddedEffect, Roles
-from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._fit_difference import undecided
 from bayesoleo.discovery._hold_out_confirmation import (
     confirmed,
@@ -26,6 +25,7 @@ from bayesoleo.discovery._hold_out_confirmation import (
     fall_on_hold_out,
     judged,
 )
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import (
     ABSORBING_FAMILIES,

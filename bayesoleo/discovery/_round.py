@@ -13,11 +13,11 @@ import numpy as np
 
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import Roles
-from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._fit_and_hold_out_error import least_noise
 from bayesoleo.discovery._fit_difference import undecided
 from bayesoleo.discovery._hold_out_confirmation import confirmed
 from bayesoleo.discovery._nonparametric_search import CurveSearch
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._ranking import ABSORBING_FAMILIES, Ranked, rank, score_candidates
 from bayesoleo.discovery._refit import Refit, refit_all

@@ -24,13 +24,10 @@ from bayesoleo._types import Array, Float
 from bayesoleo.data._noise import innovation_noise
 from bayesoleo.discovery._assembly import RecordNoise, halves
 from bayesoleo.discovery._beginnings import LIMITS, on_beginning
-from bayesoleo.discovery._fit import (
-    ModelFit,
-    changed_squares,
-    weights,
-    without_masked,
-)
+from bayesoleo.discovery._fit import ModelFit
+from bayesoleo.discovery._mesh_error import changed_squares
 from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._samples_that_count import weights, without_masked
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._estimate import estimate
 from bayesoleo.estimation._point_estimate import PointEstimate

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from bayesoleo._types import Array, Flags
 from bayesoleo.data._noise import NoiseSpectrum
-from bayesoleo.discovery._fit import ModelFit, counted, weights
+from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._fit_and_hold_out_error import RunError
 from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.discovery._samples_that_count import counted, weights
 from bayesoleo.discovery._spectral_data import SpectralData
 from bayesoleo.estimation._least_squares import PriorScale
 from bayesoleo.estimation._problem import measured_of

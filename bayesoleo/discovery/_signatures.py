@@ -19,9 +19,10 @@ from bayesoleo._types import Array
 from bayesoleo._worker_processes import process_map
 from bayesoleo.data._noise import HARMONICS, PeriodicAverage, noise_spectrum, periodic_average
 from bayesoleo.discovery._assembly import Assembly, Option
-from bayesoleo.discovery._fit import ModelFit, without_masked
+from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._ranking import scales_of
 from bayesoleo.discovery._run_predictions import Prediction, sample_noise
+from bayesoleo.discovery._samples_that_count import without_masked
 from bayesoleo.discovery._scanned_columns import Columns, Scanned
 from bayesoleo.discovery._score_basis import LEAST, coefficients
 from bayesoleo.discovery._score_tests import columns_of

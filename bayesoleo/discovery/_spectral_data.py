@@ -24,8 +24,9 @@ from scipy.special import digamma
 
 from bayesoleo._types import Array, Integers
 from bayesoleo.discovery._assembly import Added
-from bayesoleo.discovery._fit import ModelFit, weights
+from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._fit_and_hold_out_error import RunError
+from bayesoleo.discovery._samples_that_count import weights
 from bayesoleo.estimation._least_squares import PriorScale
 from bayesoleo.model._priors import LogNormal, LogUniform, Prior
 from bayesoleo.prediction._records import Record

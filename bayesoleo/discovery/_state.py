@@ -24,7 +24,8 @@ from bayesoleo.discovery._expected_error import (
     expected_of_fitted,
     expected_of_held_out,
 )
-from bayesoleo.discovery._fit import ModelFit, Numerics, fit_model, for_comparison, promising
+from bayesoleo.discovery._fewest_steps import for_comparison
+from bayesoleo.discovery._fit import ModelFit, fit_model
 from bayesoleo.discovery._fit_and_hold_out_error import (
     ErrorTable,
     Noise,
@@ -34,6 +35,8 @@ from bayesoleo.discovery._fit_and_hold_out_error import (
     with_same_noise,
 )
 from bayesoleo.discovery._noise_of_estimates import NoiseOfEstimates, colours_of
+from bayesoleo.discovery._numerics import Numerics
+from bayesoleo.discovery._other_starts import promising
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._run_predictions import Prediction, predict_fitted, predict_held_out
 from bayesoleo.discovery._score_basis import Base, base_of

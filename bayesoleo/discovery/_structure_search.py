@@ -24,7 +24,7 @@ from bayesoleo._types import Array, ProgressCallback
 from bayesoleo._worker_processes import process_map
 from bayesoleo.discovery._assembly import Added, Assembly, Option
 from bayesoleo.discovery._averaged_parameters import averaged
-from bayesoleo.discovery._fit import ModelFit, Numerics
+from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._fit_and_hold_out_error import RunError
 from bayesoleo.discovery._nonparametric_quantities import (
     TOGETHER,
@@ -33,6 +33,7 @@ from bayesoleo.discovery._nonparametric_quantities import (
     quantities_of,
 )
 from bayesoleo.discovery._nonparametric_search import coarser
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._refit import new_parameters, quick_fit
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score

@@ -18,13 +18,13 @@ from scipy import stats
 
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import Roles
-from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._hold_out_confirmation import (
     Fall,
     fall_on_hold_out,
     judged,
     lacks_input,
 )
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._refit import Refit
 from bayesoleo.discovery._state import State, fit_state

@@ -27,7 +27,7 @@ from truth_systems import Effect, Extra, Made, Noise, Plan, make, model_of
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import prepare
 from bayesoleo.discovery import StructurePosterior, StructurePrior
-from bayesoleo.discovery._fit import Numerics
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._parameter_section import Followed, Section
 from bayesoleo.discovery._ranking import score_candidates
 from bayesoleo.discovery._spectral_data import EstimatedModel, linearised

@@ -9,7 +9,8 @@ import numpy as np
 from posterior_gas_spring import gas_spring
 
 from bayesoleo.data import dataset_folder, load_campaign, reduce_campaign
-from bayesoleo.discovery._fit import Numerics, fit_model
+from bayesoleo.discovery._fit import fit_model
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.model import driven_by
 from bayesoleo.posterior import LogDensity, Mixture, laplace_mixture
 from bayesoleo.systems import system

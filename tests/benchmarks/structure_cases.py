@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from bayesoleo._workflow.simulating import to_simulated_run
 from bayesoleo.data import load_campaign, reduce_campaign, write_campaign
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._loop import ClosedLoop, close_loop
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.effects import find_effect
 from bayesoleo.model import Condition, Dof, Model, Output, Parameter
 from bayesoleo.prediction import RunPlan, motion, simulate_run

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from truth_systems import make
 
-from bayesoleo.discovery._fit import Numerics, doubtful, fit_model
+from bayesoleo.discovery._fit import fit_model
+from bayesoleo.discovery._numerics import Numerics
+from bayesoleo.discovery._other_starts import doubtful
 
 NUMERICS = Numerics(steps=128, jobs=1)
 

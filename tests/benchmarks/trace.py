@@ -30,7 +30,7 @@ import numpy as np
 
 from bayesoleo.data import ReducedCampaign, dataset_folder, load_campaign, reduce_campaign
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._fit import Numerics
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._round import examine
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.systems import system

@@ -20,8 +20,8 @@ from truth_systems import KINDS, Made, Noise, Plan, make
 
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import prepare
-from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._hold_out_confirmation import Fall, fall_on_hold_out, judged
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._ranking import estimated, score_candidates
 from bayesoleo.discovery._refit import refit
 from bayesoleo.discovery._score_tests import corrected_p

@@ -29,8 +29,8 @@ from truth_systems import Extra, Made, Noise, Plan, Sizes, make, model_of
 
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import prepare
-from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._loop import ClosedLoop, close_loop
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._score_basis import Base, coefficients
 from bayesoleo.discovery._state import State, fit_state
 from bayesoleo.model import Model, Output, Parameter

@@ -10,7 +10,7 @@ from bayesoleo._workflow.task import prepare
 from bayesoleo.data import SimulatedRun, load_campaign, reduce_campaign, write_campaign
 from bayesoleo.data._held_inputs import between_samples, count_steps, held_harmonics
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._fit import Numerics
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.errors import DataWarning
 from bayesoleo.model import Dof, Model, Output, Parameter

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bayesoleo.data import ReducedCampaign
 from bayesoleo.discovery._assembly import Assembly, Option, assign
-from bayesoleo.discovery._fit import Numerics
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._ranking import scales_of
 from bayesoleo.discovery._score_tests import Score, score_all
 from bayesoleo.discovery._state import State, fit_state

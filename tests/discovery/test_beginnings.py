@@ -8,7 +8,8 @@ from broadband_transients import KINDS, record
 
 from bayesoleo.discovery import _beginnings
 from bayesoleo.discovery._beginnings import FEWEST, LEFT, RESERVE, beginning_of
-from bayesoleo.discovery._fit import Numerics, fit_model
+from bayesoleo.discovery._fit import fit_model
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._run_predictions import predict_held_out
 from bayesoleo.estimation._problem import Evaluation
 from bayesoleo.model._drive_and_start import with_estimated_starts

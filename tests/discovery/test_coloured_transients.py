@@ -9,9 +9,10 @@ from test_noise_of_inputs import COUNT, TIME, TRUTHS, drive, true_output
 
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._effects_beside_colour import gain_beside_colour
-from bayesoleo.discovery._fit import Numerics, fit_model
+from bayesoleo.discovery._fit import fit_model
 from bayesoleo.discovery._inference import MORE_THAN_NOISE, Inference, chosen_for
 from bayesoleo.discovery._noise_of_estimates import NoiseOfEstimates, colours_of, flatness_p
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._signatures import noise_of, signatures_of
 from bayesoleo.discovery._state import state_of
 from bayesoleo.model import Model, Output, Parameter

@@ -10,14 +10,8 @@ import pytest
 from fitted_states import NUMERICS
 
 from bayesoleo.discovery import _fit
-from bayesoleo.discovery._fit import (
-    COMPARED,
-    SAMPLED,
-    ModelFit,
-    fit_model,
-    for_comparison,
-    for_sampling,
-)
+from bayesoleo.discovery._fewest_steps import SAMPLED, for_comparison, for_sampling
+from bayesoleo.discovery._fit import COMPARED, ModelFit, fit_model
 from bayesoleo.error_models import Stretch
 from bayesoleo.model import Dof, Model, Output, Parameter
 from bayesoleo.model._priors import Transforms

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from bayesoleo import system
-from bayesoleo.discovery._fit import Numerics, fit_model
+from bayesoleo.discovery._fit import fit_model
 from bayesoleo.discovery._loop import _limit, _warnings
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._result_tree import point_group
 from bayesoleo.model import Model, Parameter
@@ -75,7 +76,7 @@ def test_a_mesh_that_did_not_do_is_said_plainly(monkeypatch):
     assert "are not those of the equations" in text
     assert text in json.loads(point_group(coarse).attrs["notes"])
     assert text in _warnings(coarse)
-    monkeypatch.setattr("bayesoleo.discovery._fit._halved", lambda *_: None)
+    monkeypatch.setattr("bayesoleo.discovery._mesh_error._halved", lambda *_: None)
     assert "could not be estimated" in fit(1e-2, 1024).doubts[0]
 
 

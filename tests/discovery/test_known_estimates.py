@@ -7,7 +7,7 @@ import pytest
 from multisines import multisine_campaign, resonance
 
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._fit import Numerics
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._ranking import estimated, score_candidates
 from bayesoleo.discovery._refit import refit
 from bayesoleo.discovery._score_tests import corrected_p

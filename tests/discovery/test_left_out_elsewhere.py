@@ -5,7 +5,7 @@ import pytest
 from small_campaigns import DAMPER_RUNS, damper, damper_campaign
 
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._fit import Numerics
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._state import fit_state
 
 

@@ -11,9 +11,10 @@ from scipy.integrate import solve_ivp
 
 from bayesoleo.data import SimulatedRun, load_campaign, reduce_campaign, write_campaign
 from bayesoleo.discovery._assembly import Assembly
-from bayesoleo.discovery._fit import Numerics, fit_model
+from bayesoleo.discovery._fit import fit_model
 from bayesoleo.discovery._inference import Inference, _by_spectra, chosen_for, mode_of
 from bayesoleo.discovery._noise_of_estimates import NoiseOfEstimates
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.model import Dof, Model, Output, Parameter
 from bayesoleo.prediction._records import transient_record
 

@@ -10,8 +10,8 @@ import pytest
 from small_campaigns import damper, damper_campaign, with_friction
 
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._loop import close_loop
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._work import ENDED, work_of
 from bayesoleo.effects import find_effect
 

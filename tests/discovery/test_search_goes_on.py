@@ -10,8 +10,8 @@ import pytest
 from small_campaigns import damper, damper_campaign
 
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._fit import Numerics
 from bayesoleo.discovery._loop import close_loop, loop_of
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.effects import find_effect
 
 EFFECTS = tuple(map(find_effect, ("coulomb_friction", "quintic_stiffness", "constant_force")))

@@ -7,9 +7,10 @@ import pytest
 from fitted_states import NUMERICS
 from scipy.integrate import solve_ivp
 
-from bayesoleo.discovery import _fit as fits, _refit as refits
+from bayesoleo.discovery import _other_starts as starts_of, _refit as refits
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._fit import _likeliest, _problem
+from bayesoleo.discovery._numerics import problem_on
+from bayesoleo.discovery._other_starts import likeliest
 from bayesoleo.discovery._ranking import score_candidates
 from bayesoleo.discovery._refit import STARTS, refit, start_from
 from bayesoleo.discovery._score_basis import Base
@@ -95,7 +96,7 @@ def test_the_likeliest_start_is_taken(scored: tuple[Base, Score]) -> None:
     problem = scored[0].fit.problem
     best = scored[0].fit.point.theta
     starts = np.array([1.3 * best, best, 1.01 * best])
-    assert np.array_equal(_likeliest(problem, starts), best)
+    assert np.array_equal(likeliest(problem, starts), best)
 
 
 def test_starts_beyond_some_that_are_worse_are_not_looked_at(
@@ -104,15 +105,15 @@ def test_starts_beyond_some_that_are_worse_are_not_looked_at(
     problem = scored[0].fit.problem
     best = scored[0].fit.point.theta
     asked: list[float] = []
-    cost = fits._cost
+    cost = starts_of._cost
 
     def counted(problem, vectors):
         asked.extend(vectors[:, 0] / best[0])
         return cost(problem, vectors)
 
-    monkeypatch.setattr(fits, "_cost", counted)
+    monkeypatch.setattr(starts_of, "_cost", counted)
     starts = np.outer([3.0, 1.3, 1.2, 1.1, 1.0, 1.01], best)
-    assert np.array_equal(_likeliest(problem, starts), best)
+    assert np.array_equal(likeliest(problem, starts), best)
     assert asked == pytest.approx([1.01, 1.0, 1.1, 1.2])
 
 
@@ -125,11 +126,11 @@ def test_a_free_motion_starts_where_it_was_whatever_its_sensor_does(
     step = scored[1].option.assembly.steps[-1]
     assembly = scored[1].option.assembly.without(step)
     (option,) = assembly.options(step.scales, (find_effect(effect),))
-    problem = _problem(option.model, base.fit.records, NUMERICS, WHOLE, base.fit.predictor)
+    problem = problem_on(option.model, base.fit.records, NUMERICS, WHOLE, base.fit.predictor)
     start = start_from(base.fit, base.fit.values, option.model)
     assert problem.freeze(start).ok
-    (other,) = fits._cost(problem, start[None])
-    (own,) = fits._cost(base.fit.problem, base.fit.point.theta[None])
+    (other,) = starts_of._cost(problem, start[None])
+    (own,) = starts_of._cost(base.fit.problem, base.fit.point.theta[None])
     # Meshes of both may change this by one each; from rest it is some ten thousand more.
     assert other == pytest.approx(own, abs=2.0)
 
@@ -140,5 +141,5 @@ def test_the_first_start_is_taken_where_the_last_cannot_be_solved(
     problem = scored[0].fit.problem
     best = scored[0].fit.point.theta
     starts = np.array([1.01 * best, best, np.full_like(best, np.nan)])
-    assert np.array_equal(_likeliest(problem, starts), starts[0])
+    assert np.array_equal(likeliest(problem, starts), starts[0])
     problem.freeze(best)

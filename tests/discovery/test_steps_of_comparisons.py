@@ -8,13 +8,16 @@ import pytest
 from broadband_transients import COUNT, KINDS, oscillator, record
 
 from bayesoleo.discovery import _fit
-from bayesoleo.discovery._fit import (
-    Numerics,
+from bayesoleo.discovery._fewest_steps import for_comparison
+from bayesoleo.discovery._fit import fit_model
+from bayesoleo.discovery._mesh_error import (
+    can_be_coarser,
     changed_squares,
-    fit_model,
-    for_comparison,
+    mesh_shift,
+    squares_of_change,
     visible,
 )
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._run_predictions import predict_held_out
 from bayesoleo.discovery._score_basis import sensitivities_of
 from bayesoleo.prediction._mesh_steps import COARSEST, WHOLE
@@ -70,7 +73,7 @@ def test_a_change_along_what_is_left_counts(fitted):
     across *= np.linalg.norm(along) / np.linalg.norm(across)
 
     def seen(change):
-        return _fit._squares(fit.problem, [here], [here.y + change], fit.point)
+        return squares_of_change(fit.problem, [here], [here.y + change], fit.point)
 
     # Both changes are half a standard deviation: d.d is 1/4. Across the residual of this mesh, that
     # of the other one is shorter along d by d itself, so that |2 r.d| is twice d.d.
@@ -122,7 +125,7 @@ def test_an_estimate_and_a_hold_out_run_are_refined_along_the_residual(fitted):
     pair = by_finer_steps(
         coarse.predictor, theta, coarse.predictions[0].y, coarse.point.variance[0]
     )
-    *_, seen = _fit._mesh_shift(coarse.problem, coarse.point, coarse.predictions, free.policy)
+    *_, seen = mesh_shift(coarse.problem, coarse.point, coarse.predictions, free.policy)
     # The finest solution of a motion is not that of half the steps: both are near.
     assert seen == pytest.approx(sum(pair), rel=0.5)
     between = replace(free.policy, unseen=pair[0] + 0.3 * (seen - pair[0]))
@@ -249,7 +252,7 @@ def test_steps_of_short_records_are_joined_for_comparisons_only():
     short = transient_record("short", whole.time[:300], cut)
     fit = fit_model(model, [short], NUMERICS)
     assert fit.steps >= WHOLE
-    assert not _fit._can_be_coarser(fit.problem)
+    assert not can_be_coarser(fit.problem)
     base = for_comparison(fit)
     assert COARSEST <= base.steps <= WHOLE
     found, fine = squares(base)

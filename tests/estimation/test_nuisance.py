@@ -11,7 +11,8 @@ from bayesoleo._workflow.estimating import estimate as estimate_campaign
 from bayesoleo._workflow.model_files import from_document, to_document
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.data import SimulatedRun, write_campaign
-from bayesoleo.discovery._fit import Numerics, fit_model
+from bayesoleo.discovery._fit import fit_model
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._run_predictions import predict_held_out
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._campaign_problem import CampaignProblem

@@ -10,7 +10,8 @@ from small_campaigns import damper, damper_campaign, with_friction
 
 import bayesoleo._worker_processes as processes
 from bayesoleo.discovery._assembly import assign
-from bayesoleo.discovery._fit import Numerics, fit_model
+from bayesoleo.discovery._fit import fit_model
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.posterior import LogDensity, sample
 from bayesoleo.posterior._ensemble_moves import SharedDensity
 from bayesoleo.posterior._laplace import laplace_mixture

@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesoleo.discovery._fit import Numerics, fit_model, promising
+from bayesoleo.discovery._fit import fit_model
+from bayesoleo.discovery._numerics import Numerics
+from bayesoleo.discovery._other_starts import promising
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._problem import Held

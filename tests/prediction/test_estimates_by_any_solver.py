@@ -12,7 +12,8 @@ from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.simulating import to_simulated_run
 from bayesoleo._workflow.task import check
 from bayesoleo.data import load_campaign, reduce_campaign, write_campaign
-from bayesoleo.discovery._fit import Numerics, fit_model
+from bayesoleo.discovery._fit import fit_model
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.model import Model, Parameter
 from bayesoleo.prediction._predictor import Predictor

@@ -13,7 +13,8 @@ from scipy.integrate import solve_ivp
 from bayesoleo._workflow import predicting
 from bayesoleo.data import CampaignData, Channel, Run, reduce_campaign
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._fit import Numerics, fit_model
+from bayesoleo.discovery._fit import fit_model
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._ranking import estimated, score_candidates
 from bayesoleo.discovery._refit import compare, refit
 from bayesoleo.discovery._score_tests import corrected_p

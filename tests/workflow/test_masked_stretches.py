@@ -17,8 +17,9 @@ from bayesoleo.assessment import assess
 from bayesoleo.data import load_campaign, reduce_campaign
 from bayesoleo.data._reduction import reduce_run
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._fit import Numerics, without_masked
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._ranking import scales_of
+from bayesoleo.discovery._samples_that_count import without_masked
 from bayesoleo.discovery._score_tests import score_all
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.effects import find_effect
