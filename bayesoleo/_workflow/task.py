@@ -20,7 +20,7 @@ import xarray as xr
 from bayesoleo import _schema as schema
 from bayesoleo._compiled import is_compiled
 from bayesoleo._parallel import available_cores, thread_limit
-from bayesoleo._units import base_unit, parse_unit, same_quantity
+from bayesoleo._units import parse_unit, same_quantity
 from bayesoleo._worker_processes import begin_elsewhere
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.data._campaign import CampaignData, load_campaign
@@ -376,7 +376,7 @@ def prepare(
     _check_units(driven, reduced.campaign)
     _check_held(driven, reduced)
     reduced = within_bands(reduced, driven)
-    for sentence in (*stepped_inputs(reduced, driven), *velocities_without_place(driven)):
+    for sentence in stepped_inputs(reduced, driven):
         warnings.warn(sentence, DataWarning, stacklevel=2)
     return Task(reduced, assign(reduced.records), assembly, settings)
 
@@ -416,27 +416,6 @@ def stepped_inputs(reduced: ReducedCampaign, model: Model) -> list[str]:
             f" {half:.3g} s, half a sample, and a lag of that size would be found"
         )
     return found
-
-
-def velocities_without_place(model: Model) -> list[str]:
-    """Sentences on dofs of first order that are velocities.
-
-    A dof of first order is taken for a store (see ``effects/_places.py``). What follows a velocity,
-    such as friction, is then sought nowhere, and may be said to lie outside the catalogue.
-
-    Parameters
-    ----------
-    model : Model
-        In the drive in which it is solved.
-    """
-    rates = {base_unit("m/s"), base_unit("rad/s")}
-    return [
-        f"dof {name}, in {dof.unit}, is a velocity of first order: no friction is looked for"
-        " there, and what it does may be said to lie outside the catalogue. Declare its place as"
-        " the dof instead, of second order"
-        for name, dof in model.dofs.items()
-        if model.order(name) == 1 and dof.unit and base_unit(dof.unit) in rates
-    ]
 
 
 def within_bands(reduced: ReducedCampaign, model: Model) -> ReducedCampaign:
