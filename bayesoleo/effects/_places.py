@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from bayesoleo._units import base_unit, dimensions
+from bayesoleo._units import TORQUE, base_unit, dimensions
 from bayesoleo.errors import ModelError
 from bayesoleo.model._drive_and_start import with_starts
 from bayesoleo.model._expressions import TIME, WITHIN, derivative_symbol, split_derivative, symbol
@@ -113,13 +113,17 @@ def _require_number(expression: sp.Expr, model: Model) -> None:
 
 
 def balance_unit(model: Model, dof: str) -> str:
-    """Unit of a dof's equation: that of the first of its terms whose unit is defined."""
+    """Unit of a dof's equation: that of the first of its terms whose unit is defined, or of a later
+    one whose unit has a usual name: inertia times rad/s**2 is a torque, in N*m."""
+    found = []
     for term in model.equations[dof].values():
         try:
-            return unit_text(unit_of(term, model))
+            found.append(unit_text(unit_of(term, model)))
         except ModelError:
             continue  # a term with bare numbers in it says nothing; the next one may
-    return ""
+    unit = next((unit for unit in found if unit in _USUAL), next(iter(found), ""))
+    turns = "rad" in re.findall(r"\w+", model.dofs[dof].unit)
+    return TORQUE if unit == "J" and turns else unit
 
 
 @dataclass(frozen=True)
@@ -449,7 +453,8 @@ def _share(model: Model, pair: _Pair) -> sp.Expr | None:
             if not _moving_names(model, ratio):
                 return -one.sign * ratio
     units = [balance_unit(model, item.target) for item in (one, other)]
-    return None if units[0] != units[1] or _is_scaled(model, one) else sp.Integer(-other.sign)
+    alike = dimensions(units[0]) == dimensions(units[1])
+    return None if not alike or _is_scaled(model, one) else sp.Integer(-other.sign)
 
 
 def _is_scaled(model: Model, one: Coordinate) -> bool:
@@ -459,7 +464,7 @@ def _is_scaled(model: Model, one: Coordinate) -> bool:
     if not unit or not moved:
         return False
     orders = (1, 2) if one.order == 0 else (2,)
-    return any(parse_unit(unit) == parse_unit(moved) / parse_unit("s") ** n for n in orders)
+    return any(dimensions(unit) == dimensions(f"({moved})/s**{n}") for n in orders)
 
 
 def _moving_names(model: Model, expression: sp.Expr) -> set[str]:
