@@ -539,15 +539,21 @@ def _check_held(model: Model, reduced: ReducedCampaign) -> None:
     expressions = [*map(model.equation, model.dofs), *map(model.output, model.outputs)]
     for dof in model.dofs:
         if not any(model.expand(one).has(symbol(dof)) for one in expressions):
+            unit = model.dofs[dof].unit
+            rate = f", in {unit}/s," if unit else ""
+            instead = (
+                "leave it out"
+                if model.order(dof) == 1
+                else f"declare its rate{rate} as the dof, of first order"
+            )
             raise ModelError(
                 f"model {model.name!r}: nothing holds {dof!r}. Only its derivatives are in"
                 " equations and outputs, so that its place is unknown in a periodic run such as"
                 f" {periodic[0]}",
                 key="dofs",
                 value=dof,
-                hint="declare all runs as transients (kind = 'transient') that begin at"
-                f" Dof({model.dofs[dof].unit!r}, initial='0'); or its rate as a dof of first order,"
-                " at which no friction is looked for",
+                hint=f"{instead}; or declare all runs as transients (kind = 'transient') that begin"
+                f" at Dof({unit!r}, initial='0')",
             )
 
 

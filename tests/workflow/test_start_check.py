@@ -140,6 +140,8 @@ def test_a_dof_that_nothing_holds_is_refused_in_periodic_runs(campaign, tmp_path
     """Only its rate is determined: the linearised equations of any motion would be singular."""
     with pytest.raises(ModelError, match=r"nothing holds 'place'.*periodic run such as a.*initial"):
         workflow.check(campaign, rotor(), Settings(jobs=1))
+    with pytest.raises(ModelError, match="declare its rate, in m/s, as the dof, of first order"):
+        workflow.check(campaign, rotor(), Settings(jobs=1))
     workflow.check(campaign, rotor("+ pull*place"), Settings(jobs=1))
     transient = damper_campaign(tmp_path, transient=True).campaign
     workflow.check(transient, rotor(), Settings(jobs=1))
