@@ -37,7 +37,7 @@ from bayesoleo.discovery._score_tests import (
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._parts import Scales
 from bayesoleo.effects._places import BETWEEN
-from bayesoleo.model._model import Model
+from bayesoleo.model._model import Model, velocities_of
 from bayesoleo.model._velocity_dofs import is_velocity
 from bayesoleo.prediction._inputs import lacking
 from bayesoleo.prediction._records import Record
@@ -206,10 +206,10 @@ def _motions(
     is that of its dof, or the way since the start."""
     found = dict(rows)
     measured = {name for name, unit in native.inputs.items() if is_velocity(unit)}
-    for name in rows.keys() & (native.velocity_dofs.velocities | measured):
+    for name in rows.keys() & (velocities_of(native).velocities | measured):
         values = rows[name][0]
         way = integrate.cumulative_trapezoid(values, time, initial=0.0)
-        known = rows.get(native.velocity_dofs.position_of(name) or "")
+        known = rows.get(velocities_of(native).position_of(name) or "")
         found[name] = (way if known is None else known[0]), values
     return found
 

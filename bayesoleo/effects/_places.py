@@ -21,7 +21,7 @@ from bayesoleo.errors import ModelError
 from bayesoleo.model._drive_and_start import with_starts
 from bayesoleo.model._expressions import TIME, WITHIN, derivative_symbol, split_derivative, symbol
 from bayesoleo.model._kernels import Structured
-from bayesoleo.model._model import Model
+from bayesoleo.model._model import Model, velocities_of
 from bayesoleo.model._parameters import Coordinate
 
 #: Names that a reader expects instead of base units.
@@ -177,7 +177,7 @@ def target_units(model: Model, target: str) -> TargetUnits:
 def position_unit(model: Model, dof: str) -> str:
     """Unit of the position at a dof: where that is a velocity, of its integral."""
     unit = model.dofs[dof].unit
-    if dof not in model.velocity_dofs.velocities:
+    if dof not in velocities_of(model).velocities:
         return unit
     return unit_text(parse_unit(unit) * parse_unit("s"))
 
@@ -365,8 +365,8 @@ def _pair(model: Model, one: Coordinate, second: Coordinate | None, other: str) 
     """Two coordinates; where a twist is of the second less the first they change places."""
     twist = None
     if second is not None and one.order == second.order == 0:
-        twist = model.velocity_dofs.position_of(one.name, other)
-        turned = model.velocity_dofs.position_of(other, one.name)
+        twist = velocities_of(model).position_of(one.name, other)
+        turned = velocities_of(model).position_of(other, one.name)
         if twist is None and turned is not None:
             one, second, other, twist = second, one, one.name, turned
     if second is not None:
@@ -603,7 +603,7 @@ def spring_force(model: Model, place: Coordinate) -> sp.Expr:
     if place.position is None:
         return total
     others = {name for name in model.inputs if name != place.name}
-    others |= model.velocity_dofs.velocities
+    others |= velocities_of(model).velocities
     for term in balance_terms(model, place).values():
         whole = model.expand(term)
         free = {split_derivative(item) for item in whole.free_symbols}

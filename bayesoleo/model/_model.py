@@ -325,7 +325,7 @@ class Model:
     def _coordinates(self) -> tuple[Coordinate, ...]:
         places = []
         for dof in self.dofs:
-            if dof in self.velocity_dofs.positions:
+            if dof in self._velocity_dofs.positions:
                 continue
             top = derivative_symbol(dof, self.order(dof))
             leading = sp.diff(self.equation(dof), top).subs(self.nominal())
@@ -343,8 +343,8 @@ class Model:
 
     def _at(self, dof: str, sign: int) -> Coordinate:
         """The place of a dof's equation."""
-        if dof in self.velocity_dofs.velocities:
-            name = self.velocity_dofs.position_of(dof)
+        if dof in self._velocity_dofs.velocities:
+            name = self._velocity_dofs.position_of(dof)
             position = None if name is None else symbol(name)
             return Coordinate(
                 dof, position, symbol(dof), "equation", dof, sign, name or dof, order=0
@@ -353,7 +353,7 @@ class Model:
         return Coordinate(dof, symbol(dof), velocity, "equation", dof, sign, dof)
 
     @cached_property
-    def velocity_dofs(self) -> VelocityDofs:
+    def _velocity_dofs(self) -> VelocityDofs:
         """The velocities among the dofs of first order, and their positions."""
         quantities = self.dofs, self.parameters, self.conditions
         units = {name: item.unit for items in quantities for name, item in items.items()}
@@ -416,7 +416,7 @@ class Model:
         if any(name in known and known[name].value != p.value for name, p in parameters.items()):
             other.__dict__.pop("_coordinates", None)  # their signs follow nominal values
         if any(name in known and known[name].unit != p.unit for name, p in parameters.items()):
-            for found in ("_coordinates", "velocity_dofs"):  # units tell a body from a filter
+            for found in ("_coordinates", "_velocity_dofs"):  # units tell a body from a filter
                 other.__dict__.pop(found, None)
         if not self.parameters.keys() >= parameters.keys():
             other.__dict__.pop("structure", None)
@@ -465,6 +465,16 @@ class Model:
         return self.with_parameters(
             **{name: replace(self.parameters[name], fixed=False) for name in names}
         )
+
+
+def velocities_of(model: Model) -> VelocityDofs:
+    """The velocities among a model's dofs of first order, and their positions.
+
+    Parameters
+    ----------
+    model : Model
+    """
+    return model._velocity_dofs
 
 
 def check_units(model: Model) -> None:

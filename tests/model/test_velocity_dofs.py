@@ -6,6 +6,7 @@ import pytest
 
 from bayesoleo.model import Model, Output, Parameter
 from bayesoleo.model._expressions import symbol
+from bayesoleo.model._model import velocities_of
 from bayesoleo.model._velocity_dofs import is_velocity
 
 UNITS = {
@@ -80,8 +81,8 @@ def test_a_dof_whose_rate_is_a_difference_of_velocities_is_a_twist(equation):
     dofs = {"w": "rad/s", "q": "rad", "w2": "rad/s"}
     model = shafts(dofs, w=FREE + " + k*q", q=equation, w2="J2*dot(w2) - k*q")
     assert {name: place[0] for name, place in places(model).items()} == {"w": None, "w2": None}
-    assert model.velocity_dofs.position_of("w", "w2") == "q"
-    assert model.velocity_dofs.position_of("w2", "w") is None
+    assert velocities_of(model).position_of("w", "w2") == "q"
+    assert velocities_of(model).position_of("w2", "w") is None
 
 
 @pytest.mark.parametrize(
@@ -96,7 +97,7 @@ def test_a_dof_whose_rate_is_a_difference_of_velocities_is_a_twist(equation):
 def test_what_only_follows_a_motion_is_no_body(equation, body):
     """A filter, or what a slow sensor shows."""
     model = shafts({"w": "rad/s", "s": "rad/s"}, w=FREE, s=equation)
-    assert model.velocity_dofs.velocities == ({"w", "s"} if body else {"w"})
+    assert velocities_of(model).velocities == ({"w", "s"} if body else {"w"})
     assert {place.name for place in model.coordinates()} == {"w", "s"}
     other = next(place for place in model.coordinates() if place.name == "s")
     assert (other.velocity is not None) == body
@@ -108,15 +109,15 @@ def test_two_bodies_over_their_inertias_act_on_one_another():
         w="dot(w) + rate*(w - s) - gain*rate",
         s="dot(s) - rate*(w - s)",
     )
-    assert model.velocity_dofs.velocities == {"w", "s"}
+    assert velocities_of(model).velocities == {"w", "s"}
 
 
 def test_a_servo_that_follows_a_command_is_a_body_where_nothing_else_moves():
     servo = {"w": "tau*dot(w) + w - command"}
     inputs = {"command": "rad/s"}
-    assert shafts({"w": "rad/s"}, inputs, **servo).velocity_dofs.velocities == {"w"}
+    assert velocities_of(shafts({"w": "rad/s"}, inputs, **servo)).velocities == {"w"}
     beside = shafts({"w": "rad/s", "q": "rad"}, inputs, **servo, q="J*ddot(q) + k*(q - w*tau)")
-    assert not beside.velocity_dofs.velocities
+    assert not velocities_of(beside).velocities
 
 
 def test_units_that_are_filled_in_later_count():
@@ -124,4 +125,4 @@ def test_units_that_are_filled_in_later_count():
     model = shafts({"w": "rad/s", "s": "rad/s"}, w=FREE, s="tau*dot(s) + s - w")
     undeclared = model.with_parameters(tau=Parameter(2.0, "", relative_sd=0.5))
     filled = undeclared.with_parameters(tau=Parameter(2.0, "s", relative_sd=0.5))
-    assert filled.velocity_dofs.velocities == {"w"}
+    assert velocities_of(filled).velocities == {"w"}
