@@ -79,7 +79,7 @@ def freed() -> State:
 
 def motion_scales() -> Any:
     """Sizes of the motion, which place scan grids."""
-    return scales_of(base().fit, DRIVE, tuple(base().assembly.native.dofs))
+    return scales_of(base().fit, DRIVE, base().assembly.native)
 
 
 @cache

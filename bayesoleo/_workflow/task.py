@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import _schema as schema
-from bayesoleo._units import base_unit, parse_unit, same_quantity
+from bayesoleo._units import parse_unit, same_quantity
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.data._campaign import CampaignData, load_campaign
 from bayesoleo.data._data_warnings import data_warnings, frequency_warnings
@@ -373,7 +373,7 @@ def prepare(
     _check_units(driven, reduced.campaign)
     _check_held(driven, reduced)
     reduced = within_bands(reduced, driven)
-    for sentence in (*stepped_inputs(reduced, driven), *velocities_without_place(driven)):
+    for sentence in stepped_inputs(reduced, driven):
         warnings.warn(sentence, DataWarning, stacklevel=2)
     return Task(reduced, assign(reduced.records), assembly, settings)
 
@@ -407,27 +407,6 @@ def stepped_inputs(reduced: ReducedCampaign, model: Model) -> list[str]:
             f" {half:.3g} s, half a sample, and a lag of that size would be found"
         )
     return found
-
-
-def velocities_without_place(model: Model) -> list[str]:
-    """Sentences on dofs of first order that are velocities.
-
-    A dof of first order is taken for a store (see ``effects/_places.py``). What follows a velocity,
-    such as friction, is then sought nowhere, and may be said to lie outside the catalogue.
-
-    Parameters
-    ----------
-    model : Model
-        In the drive in which it is solved.
-    """
-    rates = {base_unit("m/s"), base_unit("rad/s")}
-    return [
-        f"dof {name}, in {dof.unit}, is a velocity of first order: no friction is looked for"
-        " there, and what it does may be said to lie outside the catalogue. Declare its place as"
-        " the dof instead, of second order"
-        for name, dof in model.dofs.items()
-        if model.order(name) == 1 and dof.unit and base_unit(dof.unit) in rates
-    ]
 
 
 def within_bands(reduced: ReducedCampaign, model: Model) -> ReducedCampaign:
@@ -551,15 +530,21 @@ def _check_held(model: Model, reduced: ReducedCampaign) -> None:
     expressions = [*map(model.equation, model.dofs), *map(model.output, model.outputs)]
     for dof in model.dofs:
         if not any(model.expand(one).has(symbol(dof)) for one in expressions):
+            unit = model.dofs[dof].unit
+            rate = f", in {unit}/s," if unit else ""
+            instead = (
+                "leave it out"
+                if model.order(dof) == 1
+                else f"declare its rate{rate} as the dof, of first order"
+            )
             raise ModelError(
                 f"model {model.name!r}: nothing holds {dof!r}. Only its derivatives are in"
                 " equations and outputs, so that its place is unknown in a periodic run such as"
                 f" {periodic[0]}",
                 key="dofs",
                 value=dof,
-                hint="declare all runs as transients (kind = 'transient') that begin at"
-                f" Dof({model.dofs[dof].unit!r}, initial='0'); or its rate as a dof of first order,"
-                " at which no friction is looked for",
+                hint=f"{instead}; or declare all runs as transients (kind = 'transient') that begin"
+                f" at Dof({unit!r}, initial='0')",
             )
 
 

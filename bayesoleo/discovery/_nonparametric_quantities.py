@@ -67,7 +67,7 @@ class ModelQuantity:
 
 
 def quantities_of(model: Model) -> list[ModelQuantity]:
-    """Positions and velocities, states of first order, and the definitions that move.
+    """Positions and velocities, other states of first order, and the definitions that move.
 
     Parameters
     ----------
@@ -80,11 +80,15 @@ def quantities_of(model: Model) -> list[ModelQuantity]:
         found.setdefault(name, ModelQuantity(name, expression, unit))
 
     for item in model.coordinates():
-        unit = model.dofs[item.name].unit if item.name in model.dofs else model.inputs[item.name]
-        add(item.name, item.position, unit)
-        if item.velocity is not None:
+        names = (item.position_name, item.name) if item.position is not None else (item.name,)
+        for name in names:
+            unit = model.dofs[name].unit if name in model.dofs else model.inputs[name]
+            add(name, symbol(name), unit)
+        if item.velocity is not None and item.order > 0:
             rate = unit_text(parse_unit(unit) / parse_unit("s"))
             add(f"velocity of {item.name}", item.velocity, rate)
+    for name, dof in model.dofs.items():
+        add(name, symbol(name), dof.unit)
     for name in model.definitions:
         own = _unit(model, name)
         if own is not None and _moves(model, name):

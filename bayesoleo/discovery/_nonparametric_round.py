@@ -216,10 +216,9 @@ class _Chance:
         return found
 
     def _estimated(self, item: Tried, merit: Merit, numerics: Numerics) -> _Answer:
-        scales = scales_of(
-            self.state.fit, self.state.assembly.drive, tuple(self.state.assembly.native.dofs)
-        )
-        result = refit(self.base, item.score(self.base, self.state.assembly, scales), numerics)
+        assembly = self.state.assembly
+        scales = scales_of(self.state.fit, assembly.drive, assembly.native)
+        result = refit(self.base, item.score(self.base, assembly, scales), numerics)
         worth = merit(result, instead=self.instead, inflation=result.inflation)
         return _Answer(self.state, self.search, result, self.outcome.ranking, self.instead, worth)
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import ndimage, optimize, stats
+from scipy import integrate, ndimage, optimize, stats
 
 from bayesoleo._types import Array, ProgressCallback
 from bayesoleo.data._harmonics import FALSE_ALARM
@@ -38,6 +38,8 @@ from bayesoleo.discovery._score_tests import (
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._parts import Scales
 from bayesoleo.effects._places import BETWEEN
+from bayesoleo.model._model import Model, velocities_of
+from bayesoleo.model._velocity_dofs import is_velocity
 from bayesoleo.prediction._inputs import lacking
 from bayesoleo.prediction._records import Record
 
@@ -126,11 +128,19 @@ def _step(record: Record) -> float:
     return float((record.time[-1] - record.time[0]) / (record.time.size - 1))
 
 
-def scales_of(fit: ModelFit, drive: str | None, native_dofs: tuple[str, ...]) -> Scales:
+def scales_of(fit: ModelFit, drive: str | None, native: Model) -> Scales:
     """Ranges of every coordinate over all fitted runs.
 
     A dof that the drive replaced has the motion of the driving channel, up to small offsets and
     gains.
+
+    Parameters
+    ----------
+    fit : ModelFit
+    drive : str or None
+        The channel that drives the fitted model.
+    native : Model
+        It in its own drive.
     """
     position: dict[str, tuple[float, float]] = {}
     velocity: dict[str, float] = {}
@@ -146,18 +156,18 @@ def scales_of(fit: ModelFit, drive: str | None, native_dofs: tuple[str, ...]) ->
         for dof, motion in run.known_motions().items():
             rows = motion(phase)
             rows_of[dof] = rows[0], rows[1]
-            add(dof, rows[0], rows[1])
         for channel, item in record.signals.items():
             values, rates = (item.evaluate(phase, record.rate, k) for k in (0, 1))
             rows_of[channel] = values, rates
-            add(channel, values, rates)
             if channel == drive:
-                for dof in native_dofs:
+                for dof in native.dofs:
                     if dof not in run.known_motions():
                         rows_of[dof] = values, rates
-                        add(dof, values, rates)
-        for (one, here), (other, there) in itertools.permutations(rows_of.items(), 2):
-            if one in native_dofs:
+        motions = _motions(native, rows_of, phase / record.rate)
+        for name in rows_of:
+            add(name, *(rows_of if name in native.inputs else motions)[name])
+        for (one, here), (other, there) in itertools.permutations(motions.items(), 2):
+            if one in native.dofs:
                 add(f"{one}{BETWEEN}{other}", here[0] - there[0], here[1] - there[1])
     outputs = {
         name: max(
@@ -188,6 +198,21 @@ def scales_of(fit: ModelFit, drive: str | None, native_dofs: tuple[str, ...]) ->
         dominant_residual_frequency(fit),
         conditions,
     )
+
+
+def _motions(
+    native: Model, rows: dict[str, tuple[Array, Array]], time: Array
+) -> dict[str, tuple[Array, Array]]:
+    """Position and velocity of all that moves, from values and rates: of a velocity the position
+    is that of its dof, or the way since the start."""
+    found = dict(rows)
+    measured = {name for name, unit in native.inputs.items() if is_velocity(unit)}
+    for name in rows.keys() & (velocities_of(native).velocities | measured):
+        values = rows[name][0]
+        way = integrate.cumulative_trapezoid(values, time, initial=0.0)
+        known = rows.get(velocities_of(native).position_of(name) or "")
+        found[name] = (way if known is None else known[0]), values
+    return found
 
 
 def _places(record: Record) -> np.ndarray:
@@ -307,7 +332,7 @@ def score_candidates(
     failed : dict of str to str
         Reason by effect without a score.
     """
-    scales = scales_of(base.fit, assembly.drive, tuple(assembly.native.dofs))
+    scales = scales_of(base.fit, assembly.drive, assembly.native)
     options = assembly.options(scales, None if effects is None else tuple(effects))
     reasons = [lacking(option.model.inputs, base.fit.records) for option in options]
     without = {

@@ -427,26 +427,36 @@ def _coordinate(loop: ClosedLoop) -> dict[str, tuple[list[Array], str, str]]:
     native = state.assembly.native
     if place is None:
         return {}
-    unit = native.dofs[place.name].unit if place.name in native.dofs else native.inputs[place.name]
+    names = (place.name,) if place.position is None else (place.position_name, place.name)
+    units = [native.dofs[n].unit if n in native.dofs else native.inputs[n] for n in names]
+    unit, rate = units[0], units[-1]
+    if place.order > 0:
+        rate = f"{unit}/s" if unit else "1/s"
     position, velocity = [], []
     for prediction in ordered(state):
-        record, run = prediction.record, prediction.predictor.runs[0]
-        motion = run.known_motions().get(place.name)
-        if motion is not None:
-            rows = motion(record.position)
-            position.append(rows[0])
-            velocity.append(rows[1])
-            continue
-        channel = place.name if place.name in record.signals else state.assembly.drive
-        if channel is None:
+        moved, *moving = (_motion_of(name, prediction, state.assembly.drive) for name in names)
+        rates = moving[0] if moving else moved
+        if moved is None or rates is None:
             return {}
-        item = record.signals[channel]
-        position.append(item.evaluate(record.position, record.rate))
-        velocity.append(item.evaluate(record.position, record.rate, 1))
-    return {
-        schema.STROKE: (position, unit, f"position of {place.name}"),
-        schema.VELOCITY: (velocity, f"{unit}/s" if unit else "1/s", f"velocity of {place.name}"),
-    }
+        position.append(moved[0])
+        velocity.append(rates[place.order])
+    found = {schema.VELOCITY: (velocity, rate, f"velocity of {place.name}")}
+    if place.position is None:
+        return found
+    return {schema.STROKE: (position, unit, f"position of {names[0]}"), **found}
+
+
+def _motion_of(name: str, prediction: Prediction, drive: str | None) -> Array | None:
+    """Value and rate of a dof, or of the channel that stands for it, at the samples of a run."""
+    record, run = prediction.record, prediction.predictor.runs[0]
+    motion = run.known_motions().get(name)
+    if motion is not None:
+        return np.asarray(motion(record.position))
+    channel = name if name in record.signals else drive
+    if channel is None:
+        return None
+    item = record.signals[channel]
+    return np.stack([item.evaluate(record.position, record.rate, k) for k in range(2)])
 
 
 def _discovery(rounds: Sequence[Round], titles: Mapping[str, str]) -> xr.Dataset:

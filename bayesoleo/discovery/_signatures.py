@@ -337,7 +337,7 @@ class FittedSignatures:
         others = tuple(_as_fit(fit, one) for one in held_out if one.record.label not in labels)
         known = scanned.take(fit, assembly, effects) if scanned else None
         if known is None:
-            scales = scales_of(fit, assembly.drive, tuple(assembly.native.dofs))
+            scales = scales_of(fit, assembly.drive, assembly.native)
             options = assembly.options(scales, None if effects is None else tuple(effects))
             known = options, process_map(columns_of, fit, options, jobs)
         sensitivity = _sensitivity(fit, noise)

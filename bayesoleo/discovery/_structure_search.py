@@ -50,6 +50,7 @@ from bayesoleo.discovery._structure_comparison import (
 from bayesoleo.discovery._structures import Structure, StructurePosterior, StructurePrior
 from bayesoleo.effects._nonparametric import Axis, balance_places
 from bayesoleo.errors import ModelError
+from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Parameter
 from bayesoleo.model._priors import LogNormal
 from bayesoleo.prediction._records import Record
@@ -73,7 +74,6 @@ UNSURE, UNSURE_SHAPE, NEGLIGIBLE = 0.01, 0.2, 0.1
 FINE, COARSE = 16, 4
 #: Part of the largest velocity within which a change of direction takes place.
 TURNING = 0.02
-_VELOCITY = "velocity of "
 
 #: What a curve is of, and its balance.
 CurveKey = tuple[str, str]
@@ -488,7 +488,7 @@ def curves_of(
     """
     motions = Motions(base.fit, assembly, quantities_of(assembly.native))
     axes = dict(motions.axes({}))
-    curves = list(_curves(motions, axes))
+    curves = list(_curves(motions, axes, assembly.native))
     some = max(TOGETHER // coarser(1, COARSE, FINE).shape[0], 1)
     places: list[tuple[str, Forced, Sequence[tuple[str, _Courses]]]] = []
     for target in balance_places(assembly.native):
@@ -527,9 +527,12 @@ def _after_each_other(several: Sequence[_Courses], r: int, phase: Array) -> Arra
     return np.concatenate([courses(r, phase) for courses in several])
 
 
-def _curves(motions: Motions, axes: Mapping[int, Axis]) -> Iterator[tuple[str, _Courses]]:
+def _curves(
+    motions: Motions, axes: Mapping[int, Axis], native: Model
+) -> Iterator[tuple[str, _Courses]]:
     """Functions by name, each as its splines (K, N) in a run at phases (N,)."""
-    number = {axis.name: k for k, axis in axes.items()}
+    number = {axis.expression: k for k, axis in axes.items()}
+    velocities = {item.position: item.velocity for item in native.coordinates()}
 
     def spline(k: int) -> _Courses:
         return lambda r, phase: axes[k].basis(motions.at(r, k, phase), FINE)
@@ -539,7 +542,7 @@ def _curves(motions: Motions, axes: Mapping[int, Axis]) -> Iterator[tuple[str, _
 
     for k, axis in axes.items():
         yield axis.name, spline(k)
-        moving = number.get(f"{_VELOCITY}{axis.name}")
+        moving = number.get(velocities.get(axis.expression))
         if moving is None:
             continue
         largest = max(abs(axes[moving].low), abs(axes[moving].high))

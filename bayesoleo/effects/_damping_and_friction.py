@@ -40,7 +40,13 @@ from bayesoleo.effects._parts import (
     velocity_grid,
     velocity_once,
 )
-from bayesoleo.effects._places import damping_terms, force_places, is_quantity, moving_places
+from bayesoleo.effects._places import (
+    damping_terms,
+    force_places,
+    is_quantity,
+    moving_places,
+    positioned_places,
+)
 from bayesoleo.model._expressions import symbol
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Coordinate
@@ -126,13 +132,14 @@ def _scaling_effect(
     amplitude: Amplitude,
     factor: Callable[[Model, Coordinate], sp.Expr],
     requires: tuple[str, ...] = (),
+    along: Callable[[Model], dict[str, Coordinate]] = moving_places,
 ) -> Effect:
     """An effect that multiplies every damping term of a balance by ``1 + amplitude * factor``."""
 
     def places(model: Model) -> tuple[str, ...]:
         if not is_quantity(model, *requires):
             return ()
-        found = moving_places(model)
+        found = along(model)
         return tuple(name for name, place in found.items() if damping_terms(model, place))
 
     def change(model: Model, target: str, names: Names) -> Model:
@@ -194,6 +201,7 @@ STROKE_DEPENDENT = _scaling_effect(
         "stroke_dependent_damping", "1/position", r"\delta_q", "relative change of damping a stroke"
     ),
     lambda model, place: place.position,
+    along=positioned_places,
 )
 
 TEMPERATURE_DEPENDENT = _scaling_effect(

@@ -213,7 +213,9 @@ def _places(model: Model) -> Sequence[str]:
 def _shown_at(model: Model, place: Coordinate) -> dict[str, sp.Expr]:
     """Outputs that show the position itself, up to a constant factor, and that factor."""
     moving = {*model.dofs, *model.inputs}
-    found = {}
+    found: dict[str, sp.Expr] = {}
+    if place.position is None:
+        return found
     for name in model.outputs:
         slope = sp.diff(model.output(name), place.position)
         if slope != 0 and not any(split_derivative(i)[0] in moving for i in slope.free_symbols):

@@ -30,11 +30,11 @@ from bayesoleo.effects._parts import (
     Scales,
     ShapeParameter,
     coordinate_of,
+    position_range,
     velocity_grid,
 )
 from bayesoleo.effects._places import (
     Between,
-    acceleration,
     balance_terms,
     between_places,
     drives,
@@ -63,6 +63,7 @@ PRESSURES = ("gas_pressure", "pressure")
 _OF_A_DIFFERENCE = {"position", "velocity", "direction"}
 _OF_A_BODY = {"acceleration", "spring_force"}
 _NEED_VELOCITY = {"velocity", "acceleration", "direction", "largest_velocity"}
+_NEED_POSITION = {"position", "lowest_position", "highest_position"}
 
 
 @dataclass(frozen=True)
@@ -100,9 +101,10 @@ def force_effect(
 ) -> Effect:
     r"""An effect that adds a resisting force to the balance of forces.
 
-    It acts in the equations of second-order dofs, or on the output of a force law. In a system of
-    first-order dofs an effect that needs no velocity acts in every equation. Between two dofs it
-    acts on both, with opposite signs (:func:`between_places`).
+    It acts in the equations of dofs that are of second order or velocities, or on the output of a
+    force law. At a velocity of which no dof is the position, an effect that needs one does not act.
+    In a system of other first-order dofs an effect that needs no velocity acts in every equation.
+    Between two dofs it acts on both, with opposite signs (:func:`between_places`).
 
     Parameters
     ----------
@@ -181,11 +183,11 @@ def _latex(expression: str, used: set[str], effect: str) -> str:
 
 
 def _lowest(model: Model, target: str, scales: Scales) -> float:
-    return scales.position[coordinate_of(model, target)][0]
+    return position_range(model, target, scales)[0]
 
 
 def _highest(model: Model, target: str, scales: Scales) -> float:
-    return scales.position[coordinate_of(model, target)][1]
+    return position_range(model, target, scales)[1]
 
 
 def _largest(model: Model, target: str, scales: Scales) -> float:
@@ -236,6 +238,8 @@ def _places_for(used: set[str], requires: tuple[str, ...]) -> Callable[[Model], 
             found = {k: item for k, item in found.items() if spring_force(model, item) != 0}
         elif used & _OF_A_DIFFERENCE and not used & _OF_A_BODY:
             found = {**found, **between_places(model)}
+        if used & _NEED_POSITION:
+            found = {k: item for k, item in found.items() if item.position is not None}
         return tuple(found)
 
     return places
@@ -359,14 +363,15 @@ def _vocabulary(model: Model, place: Coordinate, names: Names) -> dict[str, sp.E
     own: tuple[str, ...] = (*model.inputs, *model.dofs, *model.parameters)
     own += (*model.conditions, *model.definitions)
     known: dict[str, sp.Expr] = {name: symbol(name) for name in own}
-    known |= {"position": place.position}
+    if place.position is not None:
+        known |= {"position": place.position}
     if not isinstance(place, Between):
         known["spring_force"] = place.sign * spring_force(model, place)
     pressure = _pressure(model)
     if pressure is not None:
         known["pressure"] = pressure
     if place.velocity is not None:
-        known |= {"velocity": place.velocity, "acceleration": acceleration(place)}
+        known |= {"velocity": place.velocity, "acceleration": place.acceleration}
         if FRICTION_SLOPE in model.parameters or "smoothing" in names:
             known["direction"] = smooth_sign(model, place.velocity, names)
     return known | dict(names)
@@ -413,7 +418,7 @@ def _side_of_mass(model: Model, target: str) -> int:
     """
     place = force_places(model)[target]
     terms = balance_terms(model, place).values()
-    if place.kind == "equation" or any(model.expand(one).has(acceleration(place)) for one in terms):
+    if place.kind == "equation" or any(model.expand(one).has(place.acceleration) for one in terms):
         return 0
     return place.sign * resistance_sense(model, place)
 

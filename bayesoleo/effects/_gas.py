@@ -304,7 +304,7 @@ def undeclared(model: Model) -> dict[str, tuple[str, ...]]:
         return {}
     whole = as_gas_spring(model)
     # A first-order state besides the motion counts as a temperature.
-    warm = any(model.order(name) == 1 for name in model.dofs)
+    warm = any(item.kind == "equation" and item.velocity is None for item in model.coordinates())
     wanted = _ANY | (_WARM if warm else _AT_AMBIENT)
     missing = {
         effect: tuple(name for name in names if not is_quantity(whole, name))

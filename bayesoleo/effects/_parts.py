@@ -23,9 +23,11 @@ class Scales:
     Parameters
     ----------
     position : mapping of str to (float, float)
-        Lowest and highest position over all runs, by coordinate, in the coordinate's unit.
+        Lowest and highest position over all runs, by coordinate, in the coordinate's unit; of a
+        velocity, those of the way since the start of the run, in its unit times s.
     velocity : mapping of str to float
-        Largest absolute velocity, by coordinate, in the coordinate's unit per second.
+        Largest absolute velocity, by coordinate, in the coordinate's unit per second; of a
+        velocity, its own in its unit.
     output : mapping of str to float
         Peak-to-peak value by output, in the output's unit.
     shortest_period, longest_period : float
@@ -154,9 +156,14 @@ def coordinate_of(model: Model, target: str) -> str:
     return place_at(model, target).name
 
 
+def position_range(model: Model, target: str, scales: Scales) -> tuple[float, float]:
+    """Lowest and highest position at a target."""
+    return scales.position[place_at(model, target).position_name]
+
+
 def stroke_range(model: Model, target: str, scales: Scales) -> float:
     """Peak-to-peak position at a target."""
-    low, high = scales.position[coordinate_of(model, target)]
+    low, high = position_range(model, target, scales)
     return high - low
 
 

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from bayesoleo._units import base_unit, dimensions
+from bayesoleo._units import TORQUE, base_unit, dimensions
 from bayesoleo.errors import ModelError
 from bayesoleo.model._drive_and_start import with_starts
 from bayesoleo.model._expressions import TIME, WITHIN, derivative_symbol, split_derivative, symbol
 from bayesoleo.model._kernels import Structured
-from bayesoleo.model._model import Model
+from bayesoleo.model._model import Model, velocities_of
 from bayesoleo.model._parameters import Coordinate
 
 #: Names that a reader expects instead of base units.
@@ -113,13 +113,17 @@ def _require_number(expression: sp.Expr, model: Model) -> None:
 
 
 def balance_unit(model: Model, dof: str) -> str:
-    """Unit of a dof's equation: that of the first of its terms whose unit is defined."""
+    """Unit of a dof's equation: that of the first of its terms whose unit is defined, or of a later
+    one whose unit has a usual name: inertia times rad/s**2 is a torque, in N*m."""
+    found = []
     for term in model.equations[dof].values():
         try:
-            return unit_text(unit_of(term, model))
+            found.append(unit_text(unit_of(term, model)))
         except ModelError:
             continue  # a term with bare numbers in it says nothing; the next one may
-    return ""
+    unit = next((unit for unit in found if unit in _USUAL), next(iter(found), ""))
+    turns = "rad" in re.findall(r"\w+", model.dofs[dof].unit)
+    return TORQUE if unit == "J" and turns else unit
 
 
 @dataclass(frozen=True)
@@ -155,7 +159,7 @@ def target_units(model: Model, target: str) -> TargetUnits:
     target = balance_of(target) if between is None else between.target
     name, _, coordinate = target.partition("/")
     if name in model.dofs:
-        words |= {"force": balance_unit(model, name), "position": model.dofs[name].unit}
+        words |= {"force": balance_unit(model, name), "position": position_unit(model, name)}
     if name in model.parameters:
         words |= {"parameter": model.parameters[name].unit}
     if name in model.conditions:
@@ -170,11 +174,19 @@ def target_units(model: Model, target: str) -> TargetUnits:
     return TargetUnits(words)
 
 
+def position_unit(model: Model, dof: str) -> str:
+    """Unit of the position at a dof: where that is a velocity, of its integral."""
+    unit = model.dofs[dof].unit
+    if dof not in velocities_of(model).velocities:
+        return unit
+    return unit_text(parse_unit(unit) * parse_unit("s"))
+
+
 def _unit_of_quantity(model: Model, target: str, between: Between | None) -> dict[str, str]:
     """Unit of the quantity of ``place.term.quantity`` under its word, where it is known."""
     name = target.rsplit(PART, 1)[1] if PART in target else ""
-    if between is not None and name == between.name:
-        return {"quantity": model.dofs[between.dof].unit}
+    if between is not None and name == between.position_name:
+        return {"quantity": position_unit(model, between.dof)}
     if name in model.definitions:
         try:
             return {"quantity": unit_text(unit_of(symbol(name), model))}
@@ -194,9 +206,10 @@ def _unit_of_motion(model: Model, output: str, coordinate: str) -> str:
 def force_places(model: Model) -> dict[str, Coordinate]:
     """Places of a force-like effect by target.
 
-    A target is the name of a second-order dof's equation, or of an output that follows an input (a
-    force law). Where an output follows several inputs the target is ``output/input``; an input that
-    is no motion to the output's force, such as a pressure to a force, is no place.
+    A target is the name of the equation of a dof that is of second order or a velocity, or of an
+    output that follows an input (a force law). Where an output follows several inputs the target is
+    ``output/input``; an input that is no motion to the output's force, such as a pressure to a
+    force, is no place.
     """
     # An input that goes with another one is no motion of its own.
     coordinates = [item for item in model.coordinates() if WITHIN not in item.name]
@@ -204,7 +217,8 @@ def force_places(model: Model) -> dict[str, Coordinate]:
     laws = [item for item in coordinates if item.kind == "output"]
     first = [item for item in coordinates if item.kind == "equation" and item.velocity is None]
     # Where a balance of forces exists the forces act there: an output that shows an input as well
-    # (a compliant frame) is no second place, nor is the state of a memory or a temperature.
+    # (a compliant frame) is no second place, nor is the state of a memory, a temperature or the
+    # current of a motor.
     chosen = second or laws or first
     shared = Counter((item.kind, item.target) for item in chosen)
     places = {}
@@ -237,23 +251,26 @@ class Between(Coordinate):
     Parameters
     ----------
     dof, other : str
-        The coordinates: the position is ``dof - other``.
+        The coordinates: the position is ``dof - other``, or the velocity is.
     share : sympy.Expr
         What is added to the balance of ``other`` for a unit force; zero where that is an input.
+    ends : tuple of (sympy.Symbol, sympy.Symbol, sympy.Symbol)
+        Position and velocity by symbols of their own, each with those of the two coordinates.
     """
 
     dof: str = ""
     other: str = ""
     share: sp.Expr = sp.S.Zero
+    ends: tuple[tuple[sp.Symbol, sp.Symbol, sp.Symbol], ...] = ()
 
     def seen(self, expression: sp.Expr) -> sp.Expr:
         """An expression with ``dof`` in terms of the difference, which stands in its symbols."""
-        table = {
-            derivative_symbol(self.dof, n): derivative_symbol(self.name, n)
-            + derivative_symbol(self.other, n)
-            for n in range(2)
-        }
-        return expression.xreplace(table)
+        return expression.xreplace({one: own + other for own, one, other in self.ends})
+
+
+def own_velocity(place: Coordinate) -> sp.Symbol | None:
+    """The velocity of a place by a symbol of its own, also of a difference."""
+    return None if place.velocity is None else derivative_symbol(place.name, place.order)
 
 
 #: Places between two dofs that no term of the model joins, at most.
@@ -261,10 +278,12 @@ UNJOINED = 3
 
 
 def between_places(model: Model) -> dict[str, Between]:
-    """Places between two dofs of second order, or between one and an input, by target
+    """Places between two dofs of second order or velocities, or between one and an input, by target
     ``dof-other``.
 
-    They are the differences that the model's own terms follow. Where there are at most
+    They are the differences that the model's own terms follow; of two velocities the position is
+    the difference of theirs, or the dof whose rate is that of the velocities (a twist). Where there
+    are at most
     :data:`UNJOINED` of them, differences of any two dofs of one unit that have an inertia of their
     own follow, up to that number.
     Balances of two dofs that a term of the model joins may be scaled differently, as if each was
@@ -275,17 +294,17 @@ def between_places(model: Model) -> dict[str, Between]:
 
 
 class SameModel:
-    """A model as the key of a cache: equal where equations and signs are."""
+    """A model as the key of a cache: equal where equations and coordinates are."""
 
     def __init__(self, model: Model):
         self.model = model
-        self._signs = tuple((c.target, c.sign) for c in model.coordinates())
+        self._places = model.coordinates()
 
     def __hash__(self) -> int:
         return hash(self.model.structure)
 
     def __eq__(self, other: object) -> bool:
-        same = isinstance(other, SameModel) and self._signs == other._signs
+        same = isinstance(other, SameModel) and self._places == other._places
         return same and self.model.structure == other.model.structure  # type: ignore[attr-defined]
 
 
@@ -299,16 +318,70 @@ def _between(like: SameModel) -> tuple[tuple[str, Between], ...]:
     }
     others = [*bodies, *(name for name in drives(model) if name not in bodies)]
     found: dict[str, Between] = {}
-    apart: list[tuple[Coordinate, str]] = []
+    apart: list[_Pair] = []
     for one in bodies.values():
         for other in others[others.index(one.name) + 1 :]:
-            if _joins(model, one, other):
-                found |= _made(model, one, bodies.get(other), other)
-            elif other in bodies and _alike(model, one, bodies[other]):
-                apart.append((one, other))
-    for one, other in apart[: max(UNJOINED - len(found), 0)]:
-        found |= _made(model, one, bodies[other], other)
+            pair = _pair(model, one, bodies.get(other), other)
+            if _joins(model, pair):
+                found |= _made(model, pair)
+            elif pair.second is not None and _alike(model, one, pair.second):
+                apart.append(pair)
+    for pair in apart[: max(UNJOINED - len(found), 0)]:
+        found |= _made(model, pair)
     return tuple(found.items())
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Two coordinates that a force may act between.
+
+    Parameters
+    ----------
+    one : Coordinate
+        Of a dof.
+    second : Coordinate, optional
+        Of the other one, if it is a dof too.
+    other : str
+        Its name.
+    positions, velocities : tuple of sympy.Symbol
+        Of both; positions are empty where they are not known.
+    twist : str
+        The dof whose rate is the difference of the velocities; empty without one.
+    """
+
+    one: Coordinate
+    second: Coordinate | None
+    other: str
+    positions: tuple[sp.Symbol, ...]
+    velocities: tuple[sp.Symbol, sp.Symbol]
+    twist: str
+
+    def joining(self, order: int) -> tuple[sp.Symbol, ...]:
+        """The symbols of one order of the motion, if any."""
+        return (self.positions, self.velocities)[order]
+
+
+def _pair(model: Model, one: Coordinate, second: Coordinate | None, other: str) -> _Pair:
+    """Two coordinates; where a twist is of the second less the first they change places."""
+    twist = None
+    if second is not None and one.order == second.order == 0:
+        twist = velocities_of(model).position_of(one.name, other)
+        turned = velocities_of(model).position_of(other, one.name)
+        if twist is None and turned is not None:
+            one, second, other, twist = second, one, one.name, turned
+    if second is not None:
+        position, velocity = second.position, second.velocity
+    elif one.order == 0 and _is_of_unit(model.inputs[other], model.dofs[one.name].unit):
+        position, velocity = None, symbol(other)
+    else:
+        position, velocity = symbol(other), derivative_symbol(other, 1)
+    known = twist is None and one.position is not None and position is not None
+    positions = (one.position, position) if known else ()
+    return _Pair(one, second, other, positions, (one.velocity, velocity), twist or "")
+
+
+def _is_of_unit(text: str, unit: str) -> bool:
+    return bool(text) and parse_unit(text) == parse_unit(unit)
 
 
 def _alike(model: Model, one: Coordinate, other: Coordinate) -> bool:
@@ -316,22 +389,23 @@ def _alike(model: Model, one: Coordinate, other: Coordinate) -> bool:
 
     Where the inertia of one body moves with both, one coordinate is a difference already.
     """
-    mixed = model.expand(model.equation(one.target)).has(acceleration(other))
-    mixed |= model.expand(model.equation(other.target)).has(acceleration(one))
+    mixed = model.expand(model.equation(one.target)).has(other.acceleration)
+    mixed |= model.expand(model.equation(other.target)).has(one.acceleration)
     return not mixed and model.dofs[one.name].unit == model.dofs[other.name].unit
 
 
-def _joins(model: Model, one: Coordinate, other: str) -> bool:
+def _joins(model: Model, pair: _Pair) -> bool:
     """Whether a term of a balance follows the difference of two coordinates and neither alone."""
     parts = [
         part
-        for term in model.equations[one.target].values()
+        for term in model.equations[pair.one.target].values()
         for part in sp.Add.make_args(model.expand(term))
     ]
-    orders = range(2)
+    if pair.twist and any(part.has(symbol(pair.twist)) for part in parts):
+        return True
     for part in parts:
-        pairs = [[derivative_symbol(name, n) for name in (one.name, other)] for n in orders]
-        pairs = [pair for pair in pairs if part.has(*pair)]
+        pairs = [pair.joining(order) for order in range(2)]
+        pairs = [both for both in pairs if both and part.has(*both)]
         if pairs and all(
             part.has(a) and part.has(b) and sp.expand(sp.diff(part, a) + sp.diff(part, b)) == 0
             for a, b in pairs
@@ -340,39 +414,57 @@ def _joins(model: Model, one: Coordinate, other: str) -> bool:
     return False
 
 
-def _made(model: Model, one: Coordinate, other: Coordinate | None, name: str) -> dict[str, Between]:
+def _made(model: Model, pair: _Pair) -> dict[str, Between]:
     """The place between two coordinates; none where the scales of their balances are unknown."""
-    share = sp.Integer(0) if other is None else _share(model, one, other)
+    share = sp.Integer(0) if pair.second is None else _share(model, pair)
     if share is None:
         return {}
-    target = f"{one.name}{BETWEEN}{name}"
-    position, velocity = (
-        derivative_symbol(one.name, n) - derivative_symbol(name, n) for n in range(2)
-    )
-    return {
-        target: Between(
-            target, position, velocity, "equation", one.target, one.sign, one.name, name, share
-        )
-    }
+    one, name = pair.one, f"{pair.one.name}{BETWEEN}{pair.other}"
+    position, position_name = None, name
+    ends = [(derivative_symbol(name, one.order), *pair.velocities)]
+    if pair.twist:
+        position, position_name = symbol(pair.twist), pair.twist
+    elif pair.positions:
+        here, there = pair.positions
+        position = here - there
+        if one.order == 0:
+            position_name = f"{here}{BETWEEN}{there}"
+        ends.append((symbol(position_name), here, there))
+    velocity = pair.velocities[0] - pair.velocities[1]
+    place = Between(
+        name, position, velocity, "equation", one.target, one.sign, position_name, one.order,
+        one.name, pair.other, share, tuple(ends),
+    )  # fmt: skip
+    return {name: place}
 
 
-def _share(model: Model, one: Coordinate, other: Coordinate) -> sp.Expr | None:
+def _share(model: Model, pair: _Pair) -> sp.Expr | None:
     """What a unit force between two bodies adds to the second balance; None where unknown."""
+    one, other = pair.one, pair.second
+    assert other is not None
     here, there = (model.expand(model.equation(item.target)) for item in (one, other))
-    for order in range(2):
-        forth = sp.diff(here, derivative_symbol(other.name, order))
-        back = sp.diff(there, derivative_symbol(one.name, order))
+    joining = [both for both in map(pair.joining, range(2)) if both]
+    slopes = [(sp.diff(here, b), sp.diff(there, a)) for a, b in joining]
+    if pair.twist:
+        slopes.append((-sp.diff(here, symbol(pair.twist)), sp.diff(there, symbol(pair.twist))))
+    for forth, back in slopes:
         if forth != 0 and back != 0:
             ratio = sp.simplify(back / forth)
             if not _moving_names(model, ratio):
                 return -one.sign * ratio
     units = [balance_unit(model, item.target) for item in (one, other)]
-    moved = model.dofs[one.name].unit
-    if units[0] != units[1] or (
-        units[0] and moved and parse_unit(units[0]) == parse_unit(moved) / parse_unit("s") ** 2
-    ):
-        return None
-    return sp.Integer(-other.sign)
+    alike = dimensions(units[0]) == dimensions(units[1])
+    return None if not alike or _is_scaled(model, one) else sp.Integer(-other.sign)
+
+
+def _is_scaled(model: Model, one: Coordinate) -> bool:
+    """Whether the unit of a balance tells that it is divided by a mass; of one in a velocity, by a
+    damping."""
+    unit, moved = balance_unit(model, one.target), position_unit(model, one.name)
+    if not unit or not moved:
+        return False
+    orders = (1, 2) if one.order == 0 else (2,)
+    return any(dimensions(unit) == dimensions(f"({moved})/s**{n}") for n in orders)
 
 
 def _moving_names(model: Model, expression: sp.Expr) -> set[str]:
@@ -446,16 +538,16 @@ def moving_places(model: Model) -> dict[str, Coordinate]:
     return {k: item for k, item in force_places(model).items() if item.velocity is not None}
 
 
+def positioned_places(model: Model) -> dict[str, Coordinate]:
+    """Those of :func:`force_places` that have a position, unlike a free shaft."""
+    return {k: item for k, item in force_places(model).items() if item.position is not None}
+
+
 def balance_terms(model: Model, place: Coordinate) -> dict[str, sp.Expr]:
     """Named terms of the balance at a place."""
     if place.kind == "equation":
         return dict(model.equations[place.target])
     return dict(model.output_terms(place.target))
-
-
-def acceleration(place: Coordinate) -> sp.Expr:
-    """Symbol of the second derivative of the position."""
-    return derivative_symbol(place.name, 2)
 
 
 def damping_terms(model: Model, place: Coordinate) -> dict[str, sp.Expr]:
@@ -508,11 +600,14 @@ def _at_velocity(term: sp.Expr, velocity: sp.Expr, model: Model, value: float) -
 def spring_force(model: Model, place: Coordinate) -> sp.Expr:
     """Sum of the terms of a balance that follow the position and neither velocity nor an input."""
     total = sp.Integer(0)
+    if place.position is None:
+        return total
+    others = {name for name in model.inputs if name != place.name}
+    others |= velocities_of(model).velocities
     for term in balance_terms(model, place).values():
         whole = model.expand(term)
-        inputs = {name for name in model.inputs if name != place.name}
         free = {split_derivative(item) for item in whole.free_symbols}
-        moving = any(order > 0 or name in inputs for name, order in free)
+        moving = any(order > 0 or name in others for name, order in free)
         if whole.has(place.position) and not moving:
             total += term
     return total
@@ -526,8 +621,8 @@ LOOKED_FOR = frozenset(
 
 def storing_places(model: Model) -> dict[str, Coordinate]:
     """Those of :func:`force_places` where something is stored, such as the water of a tank: first
-    order, and what stands before the rate is no damping (a force over a velocity). A temperature
-    stores heat, and has no level above which that runs over.
+    order, no velocity, and what stands before the rate is no damping (a force over a velocity). A
+    temperature stores heat, and has no level above which that runs over.
 
     Where units are not declared nobody knows, and the place counts.
     """

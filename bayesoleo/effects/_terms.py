@@ -34,9 +34,10 @@ from bayesoleo.effects._places import (
     damping_terms,
     force_places,
     is_quantity,
+    own_velocity,
 )
 from bayesoleo.errors import ModelError
-from bayesoleo.model._expressions import WITHIN, derivative_symbol, split_derivative, symbol
+from bayesoleo.model._expressions import WITHIN, split_derivative, symbol
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Coordinate
 
@@ -84,9 +85,7 @@ class ModelTerm:
     @property
     def velocity(self) -> sp.Expr | None:
         """As it stands in ``whole``."""
-        if self.place.velocity is None:
-            return None
-        return derivative_symbol(self.place.name, 1)
+        return own_velocity(self.place)
 
     @property
     def vanishes_at_rest(self) -> bool:
@@ -118,7 +117,9 @@ def terms_of(model: Model) -> dict[str, ModelTerm]:
 @lru_cache(maxsize=256)
 def _terms(like: SameModel) -> tuple[tuple[str, ModelTerm], ...]:
     model = like.model
-    bodies = {place.name for place in force_places(model).values()}
+    bodies = {
+        name for place in force_places(model).values() for name in (place.name, place.position_name)
+    }
     found: dict[str, ModelTerm] = {}
     for target, place in all_places(model).items():
         for term in _at(model, place, bodies):
@@ -157,13 +158,22 @@ def _own_motion(model: Model, place: Coordinate, term: sp.Expr, bodies: set[str]
     whole = model.expand(term)
     if isinstance(place, Between):
         whole = place.seen(whole)
-    orders = {order for n, order in map(split_derivative, whole.free_symbols) if n == place.name}
-    names = {split_derivative(item)[0] for item in whole.free_symbols}
-    others = (bodies | {getattr(place, "dof", ""), getattr(place, "other", "")}) - {place.name}
-    highest = 1 if place.velocity is not None else 0
-    if not orders or max(orders) > highest or names & others:
+    own = {place.name: place.order if place.velocity is not None else 0}
+    if place.position is not None:
+        own.setdefault(place.position_name, 1)
+    found = [split_derivative(item) for item in whole.free_symbols]
+    ends = _ends(place)
+    others = (bodies | ends) - own.keys()
+    if not any(name in own for name, _ in found) or any(name in others for name, _ in found):
         return None
-    return whole
+    return None if any(order > own[name] for name, order in found if name in own) else whole
+
+
+def _ends(place: Coordinate) -> set[str]:
+    """Names of the coordinates whose difference a place is."""
+    if not isinstance(place, Between):
+        return set()
+    return {split_derivative(item)[0] for _, *pair in place.ends for item in pair}
 
 
 def _balances(
@@ -200,7 +210,8 @@ def _followed(model: Model, term: sp.Expr) -> frozenset[str]:
 
 
 def _positions(model: Model, term: ModelTerm) -> tuple[str, ...]:
-    return () if term.place.velocity is None else (term.place.name,)
+    place = term.place
+    return () if place.velocity is None or place.position is None else (place.position_name,)
 
 
 def _pressures(model: Model, term: ModelTerm) -> tuple[str, ...]:
@@ -282,8 +293,9 @@ def _is_told_otherwise(model: Model, term: ModelTerm, kind: str, quantity: str) 
     """Whether the term follows a quantity already, or another effect says the same."""
     if kind == "temperature" and quantity == term.place.name:
         return False
-    bodies = {term.place.dof, term.place.other} if isinstance(term.place, Between) else {quantity}
-    if (bodies if kind == "stroke" else {quantity}) <= term.followed:
+    position = term.place.position if kind == "stroke" else None
+    names = {quantity} if position is None else {item.name for item in position.free_symbols}
+    if names <= term.followed:
         return True
     if not term.vanishes_at_rest and term.followed & set(PRESSURES):
         return True  # the force of a gas

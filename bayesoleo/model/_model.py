@@ -23,6 +23,7 @@ from bayesoleo._units import Unit, in_si, parse_unit
 from bayesoleo.errors import InputError, ModelError
 from bayesoleo.model._expressions import derivative_symbol, parse, split_derivative, symbol
 from bayesoleo.model._parameters import Condition, Coordinate, Dof, Output, Parameter, check_start
+from bayesoleo.model._velocity_dofs import Declared, VelocityDofs, velocity_dofs
 
 type Text = str | float | sp.Expr
 type Terms = Mapping[str, sp.Expr]
@@ -315,7 +316,8 @@ class Model:
         """Every place where a force-like effect can act.
 
         These are the equations of dofs of second order, and the outputs that depend on an input (a
-        force law), and - without velocity - the equations of dofs of first order.
+        force law), and the equations of dofs of first order: those in a unit of velocity with that
+        velocity, the others without one. A dof whose rate another dof is has no place of its own.
         """
         return self._coordinates
 
@@ -323,18 +325,46 @@ class Model:
     def _coordinates(self) -> tuple[Coordinate, ...]:
         places = []
         for dof in self.dofs:
+            if dof in self._velocity_dofs.positions:
+                continue
             top = derivative_symbol(dof, self.order(dof))
             leading = sp.diff(self.equation(dof), top).subs(self.nominal())
             sign = -1 if leading.is_number and leading < 0 else 1
-            velocity = derivative_symbol(dof, 1) if self.order(dof) == 2 else None
-            places.append(Coordinate(dof, symbol(dof), velocity, "equation", dof, sign))
+            places.append(self._at(dof, sign))
         for output in self.outputs:
             names = {split_derivative(item)[0] for item in self.output(output).free_symbols}
             for name in self.inputs:
                 if name in names:
                     velocity, sign = derivative_symbol(name, 1), self._sense(output, name)
-                    places.append(Coordinate(name, symbol(name), velocity, "output", output, sign))
+                    places.append(
+                        Coordinate(name, symbol(name), velocity, "output", output, sign, name)
+                    )
         return tuple(places)
+
+    def _at(self, dof: str, sign: int) -> Coordinate:
+        """The place of a dof's equation."""
+        if dof in self._velocity_dofs.velocities:
+            name = self._velocity_dofs.position_of(dof)
+            position = None if name is None else symbol(name)
+            return Coordinate(
+                dof, position, symbol(dof), "equation", dof, sign, name or dof, order=0
+            )
+        velocity = derivative_symbol(dof, 1) if self.order(dof) == 2 else None
+        return Coordinate(dof, symbol(dof), velocity, "equation", dof, sign, dof)
+
+    @cached_property
+    def _velocity_dofs(self) -> VelocityDofs:
+        """The velocities among the dofs of first order, and their positions."""
+        quantities = self.dofs, self.parameters, self.conditions
+        units = {name: item.unit for items in quantities for name, item in items.items()}
+        return velocity_dofs(
+            Declared(
+                {dof: self.equation(dof) for dof in self.dofs},
+                {dof: self.order(dof) for dof in self.dofs},
+                {**self.inputs, **units},
+                tuple(self.inputs),
+            )
+        )
 
     def _sense(self, output: str, name: str) -> int:
         """Sign with which an output shows what resists a motion: -1 if it is the force on the other
@@ -385,6 +415,9 @@ class Model:
         known = self.parameters
         if any(name in known and known[name].value != p.value for name, p in parameters.items()):
             other.__dict__.pop("_coordinates", None)  # their signs follow nominal values
+        if any(name in known and known[name].unit != p.unit for name, p in parameters.items()):
+            for found in ("_coordinates", "_velocity_dofs"):  # units tell a body from a filter
+                other.__dict__.pop(found, None)
         if not self.parameters.keys() >= parameters.keys():
             other.__dict__.pop("structure", None)
         other._check_names()
@@ -432,6 +465,16 @@ class Model:
         return self.with_parameters(
             **{name: replace(self.parameters[name], fixed=False) for name in names}
         )
+
+
+def velocities_of(model: Model) -> VelocityDofs:
+    """The velocities among a model's dofs of first order, and their positions.
+
+    Parameters
+    ----------
+    model : Model
+    """
+    return model._velocity_dofs
 
 
 def check_units(model: Model) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import sympy as sp
 
 from bayesoleo.errors import ModelError, check_number
+from bayesoleo.model._expressions import derivative_symbol, split_derivative
 from bayesoleo.model._priors import Normal, Prior, TruncatedNormal, Uniform
 
 
@@ -249,19 +250,38 @@ class Coordinate:
     ----------
     name : str
         The dof's or the input's name.
-    position, velocity : sympy.Expr
-        Symbols of the motion; ``velocity`` is ``None`` for a first-order dof.
+    position : sympy.Expr or None
+        ``None`` for a velocity of which no dof is the position, as of a free shaft.
+    velocity : sympy.Expr or None
+        ``None`` for a dof of first order that is no velocity, such as the level of a tank.
     kind : str
         ``equation`` or ``output``: where the balance stands.
     target : str
         Name of that equation or output.
     sign : int
         A resisting force ``f`` enters as ``sign * f``.
+    position_name : str
+        Name of the position: its own, but that of another dof where the dof is a velocity.
+    order : int
+        Order of the derivative of ``name`` that is the velocity: 0 where the dof is a velocity.
     """
 
     name: str
-    position: sp.Expr
+    position: sp.Expr | None
     velocity: sp.Expr | None
     kind: str
     target: str
     sign: int
+    position_name: str
+    order: int = 1
+
+    @property
+    def acceleration(self) -> sp.Expr | None:
+        """Rate of the velocity."""
+        if self.velocity is None:
+            return None
+        rates = {}
+        for item in self.velocity.free_symbols:
+            name, order = split_derivative(item)
+            rates[item] = derivative_symbol(name, order + 1)
+        return self.velocity.xreplace(rates)

@@ -34,7 +34,7 @@ def fitted(
 
 def options(state: State, effects: Sequence[str]) -> list[Option]:
     """Candidates of some effects."""
-    scales = scales_of(state.fit, state.assembly.drive, tuple(state.assembly.native.dofs))
+    scales = scales_of(state.fit, state.assembly.drive, state.assembly.native)
     return state.assembly.options(scales, [find_effect(name) for name in effects])
 
 

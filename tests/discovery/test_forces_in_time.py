@@ -38,7 +38,7 @@ THIRD, AHEAD = 3.0, 1.0
 
 
 def scored(state):
-    scales = scales_of(state.fit, state.assembly.drive, tuple(state.assembly.native.dofs))
+    scales = scales_of(state.fit, state.assembly.drive, state.assembly.native)
     found, failed = score_all(state.base(), state.assembly.options(scales, catalogue()), jobs=1)
     return found, failed
 
@@ -142,7 +142,7 @@ def test_a_force_on_an_oscillator_at_twice_the_drive(tmp_path):
 
 def test_transients_have_no_phase_of_a_drive(hum):
     state = fitted(hum, damper())
-    scales = scales_of(state.fit, None, ())
+    scales = scales_of(state.fit, None, state.assembly.native)
     for kinds in ({"transient"}, {"periodic", "transient"}):
         offered = state.assembly.options(replace(scales, kinds=frozenset(kinds)))
         assert "periodic_force" not in {o.candidate.effect for o in offered}
@@ -238,7 +238,7 @@ def test_a_hum_of_the_sensor_is_no_force(tmp_path):
 @pytest.mark.slow
 def test_what_does_not_hum_is_not_offered_a_frequency(tmp_path):
     state, _ = shaken(tmp_path, lambda t, _: 0.0)
-    scales = scales_of(state.fit, None, ("position",))
+    scales = scales_of(state.fit, None, state.assembly.native)
     assert scales.dominant_frequency is None
     offered = {option.candidate.effect for option in state.assembly.options(scales)}
     assert not {"humming_force", "sensor_hum"} & offered

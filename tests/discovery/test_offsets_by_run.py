@@ -27,7 +27,7 @@ METRES = (2e-3, -1e-3, 1.5e-3, -2e-3, 1e-3)
 
 
 def scored(state, effects=None):
-    scales = scales_of(state.fit, state.assembly.drive, tuple(state.assembly.native.dofs))
+    scales = scales_of(state.fit, state.assembly.drive, state.assembly.native)
     chosen = catalogue() if effects is None else tuple(map(find_effect, effects))
     return score_all(state.base(), state.assembly.options(scales, chosen), jobs=1)[0]
 

@@ -130,7 +130,7 @@ def first_class(folder, model, oleo):
     roles = assign(campaign(folder, oleo).records)
     roles = replace(roles, fitted=(*roles.fitted, *roles.held_out), held_out=())
     state = fit_state(Assembly(model, "displacement"), roles, NUMERICS)
-    scales = scales_of(state.fit, "displacement", tuple(state.assembly.native.dofs))
+    scales = scales_of(state.fit, "displacement", state.assembly.native)
     scores, _ = score_all(state.base(), state.assembly.options(scales, catalogue()), jobs=1)
     found = {scores[k].option.candidate.effect for k in (0, *classes(scores)[0])}
     return found, scores, state

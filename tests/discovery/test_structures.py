@@ -153,7 +153,7 @@ def test_curves_that_are_solved_together_are_those_solved_alone(plain):
     """Also where one of them is no number: it is left out, and the other is not."""
     base, assembly = plain.base(), plain.assembly
     motions = Motions(base.fit, assembly, quantities_of(assembly.native))
-    curves = [courses for _, courses in _curves(motions, dict(motions.axes({})))]
+    curves = [courses for _, courses in _curves(motions, dict(motions.axes({})), assembly.native)]
     (target,) = balance_places(assembly.native)
     forced = Forced(base.fit, assembly, target)
 

@@ -89,7 +89,7 @@ def fitted(reduced):
 
 def scored(state, *names):
     """Scores by effect."""
-    scales = scales_of(state.fit, None, ())
+    scales = scales_of(state.fit, None, state.assembly.native)
     found = state.assembly.options(scales, [find_effect(name) for name in names])
     scores, _ = score_all(state.base(), found, jobs=1)
     return {score.option.candidate.effect: score for score in scores}

@@ -10,7 +10,7 @@ from small_campaigns import damper, damper_campaign
 
 from bayesoleo import Campaign, _workflow as workflow
 from bayesoleo._workflow.settings import Settings
-from bayesoleo._workflow.task import StartCheck, about_start, velocities_without_place
+from bayesoleo._workflow.task import StartCheck, about_start
 from bayesoleo.data import CampaignData
 from bayesoleo.errors import DataWarning, ModelError
 from bayesoleo.model import Model, Output, Parameter
@@ -140,23 +140,8 @@ def test_a_dof_that_nothing_holds_is_refused_in_periodic_runs(campaign, tmp_path
     """Only its rate is determined: the linearised equations of any motion would be singular."""
     with pytest.raises(ModelError, match=r"nothing holds 'place'.*periodic run such as a.*initial"):
         workflow.check(campaign, rotor(), Settings(jobs=1))
+    with pytest.raises(ModelError, match="declare its rate, in m/s, as the dof, of first order"):
+        workflow.check(campaign, rotor(), Settings(jobs=1))
     workflow.check(campaign, rotor("+ pull*place"), Settings(jobs=1))
     transient = damper_campaign(tmp_path, transient=True).campaign
     workflow.check(transient, rotor(), Settings(jobs=1))
-
-
-@pytest.mark.parametrize(
-    ("unit", "told"), [("m/s", 1), ("rad/s", 1), ("V", 0), ("1/s", 0), ("", 0)]
-)
-def test_friction_is_not_looked_for_at_a_velocity_without_place(unit, told):
-    model = Model(
-        "motor",
-        inputs={"torque": "N*m"},
-        dofs={"speed": unit},
-        parameters={"inertia": Parameter(1.0, "", relative_sd=0.5)},
-        equations={"speed": {"inertia": "inertia*dot(speed)", "drive": "-torque"}},
-        outputs={"shown": Output("speed", unit)},
-    )
-    found = velocities_without_place(model)
-    assert len(found) == told
-    assert all("dof speed" in text and "no friction" in text for text in found)
