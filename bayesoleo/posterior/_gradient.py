@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import Protocol, cast, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -193,9 +193,7 @@ class Gradient:
         return found
 
 
-def _by_run(
-    evaluation: Evaluation, counts: Array
-) -> tuple[list[list[Array]], list[list[Array]]]:
+def _by_run(evaluation: Evaluation, counts: Array) -> tuple[list[list[Array]], list[list[Array]]]:
     """Residuals (n,) and sensitivities (l, n) by run and output."""
     ends = np.cumsum(counts, axis=0)
     residuals, columns = [], []
@@ -203,7 +201,10 @@ def _by_run(
         cuts = [slice(a, b) for a, b in zip(first, last, strict=True)]
         residuals.append([e[c] for e, c in zip(evaluation.residual, cuts, strict=True)])
         columns.append(
-            [np.ascontiguousarray(j[c].T) for j, c in zip(evaluation.sensitivity, cuts, strict=True)]
+            [
+                np.ascontiguousarray(j[c].T)
+                for j, c in zip(evaluation.sensitivity, cuts, strict=True)
+            ]
         )
     return residuals, columns
 
