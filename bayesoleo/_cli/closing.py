@@ -361,7 +361,8 @@ SOME_FAILED = 1
 
 @options.of_settings(
     "quick", "seed", "effective_size", "sampler", "max_effects", "effects", "without",
-    *options.SOLVED, "nuisance", "disturbances", "error_model", "between_runs", "structure_prior", "next_run",
+    *options.SOLVED, "nuisance", "disturbances", "error_model", "between_runs", "structure_prior",
+    "next_run",
 )  # fmt: skip
 def each(
     campaigns: Annotated[list[Path], options.argument("CAMPAIGN", "Folders with campaign.toml.")],

@@ -34,7 +34,7 @@ import numpy as np
 from bayesoleo._parallel import available_cores, thread_limit
 from bayesoleo._storage.files import only_writer
 from bayesoleo._storage.resume import Arrays, Slots
-from bayesoleo._types import Array, Float, Int, Integers
+from bayesoleo._types import Array, Bool, Flags, Float, Int, Integers
 from bayesoleo.errors import InputError, import_extra
 from bayesoleo.posterior._diagnostics import Samples
 from bayesoleo.posterior._gradient import Differentiable, Gradient, gradient_of
@@ -93,7 +93,7 @@ class Trace:
     """
 
     coords: Float[Array, "chains draws coordinates"]
-    diverging: Integers
+    diverging: Bool[Flags, "chains draws"]
     steps: Int[Integers, "chains draws"]
     accept: Float[Array, "chains draws"]
     first: Float[Array, "chains coordinates"]
