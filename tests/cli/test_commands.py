@@ -307,6 +307,6 @@ def test_the_sampler_is_passed_on(run, campaign, model, made_up, monkeypatch, gi
 
 def test_an_unknown_sampler_names_the_known(run, campaign, model):
     result = run("sample", campaign, "-m", model, "--sampler", "hmc")
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert "--sampler" in result.output
     assert "ensemble, nuts" in result.output
