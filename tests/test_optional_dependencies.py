@@ -9,6 +9,7 @@ import xarray as xr
 
 from bayesoleo._parallel import connected
 from bayesoleo._storage.result_files import read_tree, write_tree
+from bayesoleo._workflow.settings import Settings
 from bayesoleo.data import dataset_folder
 from bayesoleo.data._campaign import VARIABLE
 from bayesoleo.data._files import read_columns
@@ -19,6 +20,7 @@ EXTRAS = {
     "dask": "distributed",
     "data": "pooch",
     "formats": "nptdms",
+    "nuts": "nutpie",
     "parquet": "pyarrow",
     "zarr": "zarr",
 }
@@ -48,6 +50,7 @@ def connect(folder):
         ("dask", connect),
         ("data", lambda folder: dataset_folder("silverbox")),
         ("formats", lambda folder: read_columns(folder / "run.tdms")),
+        ("nuts", lambda folder: Settings(sampler="nuts")),
         ("parquet", lambda folder: read_columns(folder / "run.parquet")),
         ("zarr", lambda folder: read_tree(folder / "result.zarr")),
         ("zarr", lambda folder: write_tree(xr.DataTree(), folder / "new.zarr")),

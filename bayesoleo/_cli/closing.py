@@ -362,8 +362,9 @@ SOME_FAILED = 1
 
 
 @options.of_settings(
-    "quick", "seed", "effective_size", "max_effects", "effects", "without", *options.SOLVED,
-    "nuisance", "disturbances", "error_model", "between_runs", "structure_prior", "next_run",
+    "quick", "seed", "effective_size", "sampler", "max_effects", "effects", "without",
+    *options.SOLVED, "nuisance", "disturbances", "error_model", "between_runs", "structure_prior",
+    "next_run",
 )  # fmt: skip
 def each(
     campaigns: Annotated[list[Path], options.argument("CAMPAIGN", "Folders with campaign.toml.")],

@@ -25,7 +25,7 @@ OUTPUT = "What is written"
 #: Settings that say how the model is solved, in the order of ``--help``.
 SOLVED = ("drive", "scheme", "solver", "steps")
 #: Settings of the sampler.
-SAMPLED = ("quick", "seed", "jobs", "scheduler", "effective_size")
+SAMPLED = ("quick", "seed", "jobs", "scheduler", "effective_size", "sampler")
 _OPTIONS: dict[str, SettingOption] = {
     item.name: item.metadata[OPTION] for item in fields(Settings) if OPTION in item.metadata
 }

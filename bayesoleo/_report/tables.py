@@ -67,6 +67,7 @@ DIAGNOSTICS = {
     "evaluations": "evaluations of the posterior",
     "branch_jumps": "solutions that left the estimate's branch",
     "reached": "effective size asked for reached",
+    "divergences": "trajectories that diverged",
 }
 BY_PARAMETER = {
     "autocorrelation_time": ("autocorrelation time, draws", "{:.1f}"),
@@ -353,7 +354,8 @@ def diagnostics(tree: xr.DataTree) -> Table | None:
     posterior = reading.group(tree, schema.POSTERIOR)
     if posterior is not None:
         sizes = posterior.sizes
-        rows.append(["walkers × draws", f"{sizes[schema.CHAIN]} × {sizes[schema.DRAW]}"])
+        chains = "chains" if attributes.get("sampler") else "walkers"
+        rows.append([f"{chains} × draws", f"{sizes[schema.CHAIN]} × {sizes[schema.DRAW]}"])
     for key, value in attributes.items():
         by_parameter = key in BY_PARAMETER and isinstance(_decoded(value), dict)
         if key == "failures" or by_parameter:

@@ -230,7 +230,7 @@ def load_campaign(path: str | os.PathLike[str], *, progress: bool = True) -> Cam
 
 
 #: Settings that may still be changed when the posterior is sampled, and in a search.
-SAMPLING = ("seed", "jobs", "quick", "effective_size", "scheduler")
+SAMPLING = ("seed", "jobs", "quick", "effective_size", "sampler", "scheduler")
 SEARCHING = (
     "seed", "jobs", "quick", "scheduler", "max_effects", "effects", "without", "structure_prior",
 )  # fmt: skip

@@ -293,11 +293,12 @@ class Fit(Stored):
         Parameters
         ----------
         out : path-like, optional
-            Folder of checkpoints, from which a run that was stopped goes on.
+            Folder of checkpoints, from which a run that was stopped goes on; with
+            ``sampler="nuts"`` it starts over.
         progress : bool
         **settings
-            ``seed``, ``effective_size``, ``quick``, ``jobs``, ``scheduler``; see
-            :class:`Settings`.
+            ``seed``, ``effective_size``, ``sampler``, ``quick``, ``jobs``, ``scheduler``;
+            see :class:`Settings`.
 
         Returns
         -------

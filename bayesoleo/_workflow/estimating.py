@@ -49,7 +49,7 @@ from bayesoleo.model._model import Model
 from bayesoleo.posterior._comparison import compare
 from bayesoleo.posterior._diagnostics import Samples
 from bayesoleo.posterior._log_density import LogDensity
-from bayesoleo.posterior._sampler import sample as draw_samples
+from bayesoleo.posterior._sampler import NUTS, sample as draw_samples
 from bayesoleo.solvers._schemes import COLLOCATION
 
 
@@ -230,7 +230,7 @@ def sample(
     callback: ProgressCallback = silent,
     progress: bool = False,
 ) -> xr.DataTree:
-    """Estimate, then sample the posterior from there with emcee.
+    """Estimate, then sample the posterior from there.
 
     Parameters are those of :func:`close`, and so are its errors; the tree has the groups of the
     records, the point and the posterior. The estimate is written before the posterior is sampled.
@@ -340,6 +340,8 @@ def draw_from(
     start = mixture_at(density, theta, starts=starts, seed=settings.seed)
     # Another seed or quality is another run, with a folder of its own.
     parts = [*of, settings.seed, settings.quick, settings.error_model, settings.between_runs]
+    by_gradients = settings.sampler == NUTS
+    parts += [settings.sampler] if by_gradients else []
     fingerprint = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
     return draw_samples(
         density,
@@ -351,5 +353,6 @@ def draw_from(
         progress=progress,
         quick=settings.quick,
         climbs=CLIMBS,
-        scheduler=settings.scheduler,
+        scheduler=None if by_gradients else settings.scheduler,
+        sampler=settings.sampler,
     )

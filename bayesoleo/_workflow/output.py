@@ -217,7 +217,9 @@ def search_key(task: Task) -> dict[str, str]:
     """Digests of all that a search depends on."""
     # How much is drawn from the posterior has no say in what is missing, and probabilities of
     # structures are computed once the search has ended.
-    same = {"quick": False, "effective_size": 0, "command": "", "structure_prior": None}
+    same = {
+        "quick": False, "effective_size": 0, "sampler": "", "command": "", "structure_prior": None,
+    }  # fmt: skip
     settings = {f.name: getattr(task.settings, f.name) for f in fields(task.settings)} | same
     return {
         "campaign": digest((task.campaign.sha256, task.reduced.records)),

@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import Field, dataclass, field, fields, replace
+from importlib.util import find_spec
 from numbers import Integral
 from typing import TYPE_CHECKING, Any, cast
 
-from bayesoleo.errors import InputError, choose
+from bayesoleo.errors import InputError, MissingExtraError, choose
 
 if TYPE_CHECKING:
     from bayesoleo.discovery._inference import Inference
@@ -227,6 +228,10 @@ class Settings:
         Draw enough for two-digit intervals only, and end a search early that takes minutes.
     effective_size : int
         Effective draws asked of the sampler.
+    sampler : {"ensemble", "nuts"}
+        Of the posterior: ensembles of walkers, or the no-U-turn sampler, which follows gradients
+        and starts over where it was stopped. It needs nutpie, and draws in threads of this process
+        whatever the ``scheduler``.
     scheme : str
         Discretisation: ``radau3`` …, or ``thesis``.
     solver : {"collocation", "adaptive", "shooting", "hybrid", "library"}
@@ -289,6 +294,12 @@ class Settings:
     effective_size: int = _setting(
         1000, int, RUNNING, "Draw until every parameter has this effective sample size.",
         min=10, metavar="N",
+    )  # fmt: skip
+    sampler: str = _setting(
+        "ensemble", str, RUNNING,
+        "Sampler of the posterior: ensemble, or nuts, which follows gradients (in threads of this "
+        "process). A run of nuts that is stopped starts over.",
+        metavar="ensemble|nuts",
     )  # fmt: skip
     scheme: str = _setting(
         "radau3", str, SOLVING,
@@ -381,6 +392,7 @@ class Settings:
             raise InputError("unknown scheme", key="scheme", value=self.scheme, hint=hint)
         check_solver(self.solver, self.scheme)
         check_word(self.error_model, automatic=True)
+        self._check_sampler()
         for kind in self.disturbances:
             if kind not in DISTURBANCES:
                 raise InputError(
@@ -393,6 +405,16 @@ class Settings:
             if name not in known:
                 hint = choose(name, known, 3)
                 raise InputError("unknown effect", key="without", value=name, hint=hint)
+
+    def _check_sampler(self) -> None:
+        if self.sampler == "ensemble":
+            return
+        from bayesoleo.posterior._sampler import check_sampler
+
+        check_sampler(self.sampler)
+        if find_spec("nutpie") is None:
+            # Before a search of hours, not after it.
+            raise MissingExtraError("nutpie", "nuts")
 
     def _check_structure_prior(self) -> None:
         from bayesoleo.discovery._structures import StructurePrior

@@ -148,6 +148,21 @@ class CampaignProblem:
         runs = self.predictor.outputs_first(self.full(theta[None])[0])
         return None if runs is None else self._of_runs(runs)
 
+    def evaluate_anchored(self, theta: Array) -> Evaluation:
+        """Residuals and sensitivities at one vector from the frozen anchor, which stays.
+
+        They depend on the vector alone, as :meth:`misfit` does.
+        """
+        return self._of_runs(self.predictor.predict(self.full(theta[None])[0]), self._free)
+
+    def for_thread(self) -> CampaignProblem:
+        """A copy that works in one thread and counts jumps of its own, from the same anchors."""
+        other = copy(self)
+        other.predictor, other._last = copy(self.predictor), None
+        other.predictor.jobs = 1
+        other.predictor.runs = [copy(run) for run in self.predictor.runs]
+        return other
+
     def _evaluate(self, theta: Array) -> Evaluation:
         return self._of_runs(self.predictor.evaluate(self.full(theta[None])[0]), self._free)
 

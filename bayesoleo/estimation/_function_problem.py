@@ -227,6 +227,11 @@ class FunctionProblem:
         return (self._y,)
 
     @property
+    def has_derivatives(self) -> bool:
+        """Whether the user gave derivatives; those by differences take many evaluations each."""
+        return self._jacobian is not None
+
+    @property
     def lanes(self) -> int:
         """Vectors whose predictions with their differences fit the cache."""
         stencil = 1 + (2 * _OFFSETS.size * len(self._names) if self._jacobian is None else 0)

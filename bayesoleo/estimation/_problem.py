@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Protocol, cast, runtime_checkable
 
@@ -70,6 +71,25 @@ def residuals_first(
     step that does not improve them needs no more."""
     first = getattr(problem, "residuals_first", None)
     return None if first is None else cast("Evaluation | None", first(theta))
+
+
+def anchored_evaluation(problem: EstimationProblem, theta: Float[Array, " unknowns"]) -> Evaluation:
+    """Residuals and sensitivities at one vector that depend on that vector alone, as a misfit does.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        A campaign's starts each solution from its anchor, which stays; others have none.
+    theta : ndarray, shape (l,)
+    """
+    found = getattr(problem, "evaluate_anchored", problem.evaluate)
+    return cast("Evaluation", found(theta))
+
+
+def for_thread[P: EstimationProblem](problem: P) -> P:
+    """A problem that may be evaluated while others of its kind are, in one thread."""
+    copied = getattr(problem, "for_thread", None)
+    return problem if copied is None else cast("P", copied())
 
 
 def jumps_of(problem: EstimationProblem) -> Int[Integers, " runs"]:
@@ -267,6 +287,17 @@ class Held(SameData):
         """Residuals and sensitivities at one vector of the free unknowns."""
         found = self.problem.evaluate(self.full(np.asarray(theta, dtype=float)))
         return replace(found, sensitivity=tuple(s[:, self.free] for s in found.sensitivity))
+
+    def evaluate_anchored(self, theta: Array) -> Evaluation:
+        """The same from the anchor, see :func:`anchored_evaluation`."""
+        found = anchored_evaluation(self.problem, self.full(np.asarray(theta, dtype=float)))
+        return replace(found, sensitivity=tuple(s[:, self.free] for s in found.sensitivity))
+
+    def for_thread(self) -> Held:
+        """A copy that other threads leave alone, see :func:`for_thread`."""
+        other = copy(self)
+        other.problem = for_thread(self.problem)
+        return other
 
     def residuals_first(self, theta: Array) -> Evaluation | None:
         """Residuals without sensitivities, see :func:`residuals_first`."""

@@ -499,8 +499,14 @@ def _sample_stats(samples: Samples) -> xr.Dataset:
     attributes["branch_jumps"] = samples.branch_jumps
     attributes["reached"] = int(samples.reached)  # netCDF has no truth values
     attributes["warning"] = samples.warning
+    if samples.diverging is not None:
+        attributes["sampler"], attributes["divergences"] = samples.sampler, samples.divergences
     about = {"units": "1", "long_name": "log posterior density over coordinates without bounds"}
     variables: dict[str, object] = {"lp": (("chain", "draw"), samples.log_density, about)}
+    if samples.diverging is not None:
+        about = {"units": "1", "long_name": "whether the trajectory to a draw diverged"}
+        # netCDF has no truth values
+        variables["diverging"] = (("chain", "draw"), samples.diverging.astype(np.int8), about)
     coordinates = _coordinates(samples)
     if len(samples.failed):
         about = {"units": "1", "long_name": "proposals of density zero on the way to a draw"}

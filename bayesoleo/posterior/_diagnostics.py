@@ -8,7 +8,7 @@ import numpy as np
 from scipy import stats
 
 from bayesoleo import _schema as schema
-from bayesoleo._types import Array, Float, Int, Integers
+from bayesoleo._types import Array, Bool, Flags, Float, Int, Integers
 from bayesoleo.data._fourier import lagged_products
 from bayesoleo.posterior._checkpoints import REASONS
 from bayesoleo.posterior._log_density import LOG_VARIANCE
@@ -182,7 +182,7 @@ class Samples:
     reached : bool
         Whether the requested effective size was reached and the ensembles agree.
     warning : str
-        Criteria that were not met; empty otherwise.
+        Criteria that were not met, and trajectories that diverged; empty otherwise.
     failed : ndarray of int, shape (draws, reasons)
         Proposals of density zero on the way to each kept draw, one
         column for each :class:`~bayesoleo.solvers.Status` that is a failure.
@@ -191,6 +191,12 @@ class Samples:
     jumped_part : float
         Those among the kept draws' proposals over the accepted ones: were all of them accepted,
         the density would be that of other answers of the model to this part.
+    sampler : {"ensemble", "nuts"}
+        Which one drew.
+    diverging : ndarray of bool, shape (chains, draws), or None
+        Of the no-U-turn sampler: whether a draw's trajectory diverged.
+    divergences : int
+        Those of all draws, also of ones that are not handed on.
     """
 
     names: tuple[str, ...]
@@ -214,6 +220,9 @@ class Samples:
     failed: Int[Integers, "_draws reasons"] = field(
         default_factory=lambda: np.zeros((0, len(REASONS)), dtype=np.int64)
     )
+    sampler: str = "ensemble"
+    diverging: Bool[Flags, "chains draws"] | None = None
+    divergences: int = 0
 
     def thinned(self, most: int) -> Samples:
         """Equally spaced draws of each chain, so that about ``most`` draws remain.
@@ -233,6 +242,7 @@ class Samples:
             log_density=self.log_density[:, rows],
             log_likelihood=self.log_likelihood[:, rows],
             failed=failed,
+            diverging=None if self.diverging is None else self.diverging[:, rows],
         )
 
     @property

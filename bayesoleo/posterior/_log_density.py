@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol, cast
@@ -25,6 +26,7 @@ from bayesoleo.estimation._problem import (
     EstimationProblem,
     Misfit,
     ResidualProblem,
+    for_thread,
     jumps_of,
     unwatched,
 )
@@ -340,6 +342,13 @@ class LogDensity:
             np.ascontiguousarray(phi[:, : self._size]),
             np.ascontiguousarray(phi[:, self._size :]),
         )
+
+    def for_thread(self) -> LogDensity:
+        """A copy that may be evaluated beside others, in one thread, with counts of its own."""
+        other = copy(self)
+        other.problem, other.jobs = for_thread(self.problem), 1
+        other.evaluations, other.failures = 0, Counter()
+        return other
 
     @property
     def branch_jumps(self) -> int:

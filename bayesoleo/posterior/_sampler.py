@@ -7,25 +7,18 @@ import json
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from tqdm.auto import tqdm
 
 from bayesoleo._parallel import connected, single_blas_thread
-from bayesoleo._types import Array
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, choose, import_extra
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._problem import unwatched
 from bayesoleo.posterior._checkpoints import Segment, Store, open_store
-from bayesoleo.posterior._diagnostics import (
-    Samples,
-    autocorrelation_time,
-    effective_size as effective_size_of,
-    nested_rhat,
-    rhat_limit,
-)
+from bayesoleo.posterior._diagnostics import Samples, autocorrelation_time
 from bayesoleo.posterior._ensemble_moves import (
     DistributedDensity,
     Ensembles,
@@ -36,7 +29,18 @@ from bayesoleo.posterior._ensemble_moves import (
 from bayesoleo.posterior._log_density import Density, LogDensity
 from bayesoleo.posterior._mixture import Mixture
 from bayesoleo.posterior._mode_search import with_other_modes
+from bayesoleo.posterior._stopping import (
+    ProgressBar,
+    Quality,
+    Schedule,
+    decisions,
+    quality_of,
+    sizes_of_every,
+    stride_of,
+)
 
+#: Samplers by name: ensembles of walkers, and the no-U-turn sampler.
+SAMPLERS = (ENSEMBLE, NUTS) = ("ensemble", "nuts")
 #: Starting points of the mode search, in full and in quick runs.
 CLIMBS, QUICK_CLIMBS = 32, 16
 #: Fraction of the evaluations that the mode search may take.
@@ -46,85 +50,6 @@ SEARCHING = 0.25
 QUICK_EVALUATIONS, QUICK_TIME_STEPS, QUICK_STEPS = 40_000, 70_000_000, 64
 #: Acceptance of the independence move below which its mixture misses the posterior.
 MISSES = 0.15
-#: Draws that are handed on at least, where each one costs a factorisation for each run, and by
-#: quick runs.
-ENOUGH, ENOUGH_QUICK = 4_000, 1_000
-#: What it costs to predict and to store with a draw, in evaluations of the density.
-COSTS = 3
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """Schedule of sampling: adaptation, length of segments, stopping rule.
-
-    Parameters
-    ----------
-    effective_size : float
-        Requested effective sample size of every quantity.
-    max_evaluations : int
-        Budget of rows of the log density; no segment begins that would exceed it.
-    warm_up : int
-        Draws of the first warm-up round; each later one has twice as many.
-    most_rounds : int
-        Warm-up rounds at most.
-    least_rounds : int
-        Warm-up rounds before proposals of the mixture that are accepted may end it.
-    least : int
-        Kept draws of each walker before the stopping rule is applied.
-    times : float
-        Kept draws, in autocorrelation times, from which the estimates are reliable.
-    segment : int
-        Draws of the longest segment, the most that an interruption can lose.
-    """
-
-    effective_size: float
-    max_evaluations: int
-    warm_up: int
-    most_rounds: int
-    least_rounds: int
-    least: int
-    times: float
-    segment: int
-
-
-@dataclass(frozen=True)
-class Quality:
-    """Diagnostics of the draws kept so far.
-
-    Parameters
-    ----------
-    times, sizes, rhat : ndarray, shape (d,)
-        Autocorrelation time, effective size, nested R-hat.
-    draws : int
-        Kept draws of each walker.
-    """
-
-    times: Array
-    sizes: Array
-    rhat: Array
-    draws: int
-
-    def shortfalls(self, schedule: Schedule, ensembles: int) -> list[str]:
-        """Criteria that are not met yet, in words; empty if all are."""
-        if not np.all(np.isfinite(self.times)):
-            return ["a quantity never moved"]
-        short = []
-        if self.sizes.min() < schedule.effective_size:
-            short.append(
-                f"the effective size is {self.sizes.min():.0f}"
-                f" of {schedule.effective_size:.0f} asked for"
-            )
-        if self.draws < schedule.times * self.times.max():
-            short.append(
-                f"{self.draws} draws are fewer than {schedule.times:.0f}"
-                f" autocorrelation times of {self.times.max():.1f}"
-            )
-        limit = rhat_limit(ensembles, schedule.effective_size)
-        if self.rhat.max() > limit:
-            short.append(
-                f"the ensembles disagree: nested R-hat {self.rhat.max():.3f} above {limit:.3f}"
-            )
-        return short
 
 
 @single_blas_thread()  # matrices are small: threads take longer to meet than to work
@@ -145,6 +70,8 @@ def sample(
     quick: bool = False,
     climbs: int | None = None,
     scheduler: str | None = None,
+    sampler: str = ENSEMBLE,
+    target_accept: float = 0.8,
 ) -> Samples:
     """Draw from a density until every quantity has the effective size asked for.
 
@@ -188,17 +115,32 @@ def sample(
         mode reach their effective sample size there and miss others.
     scheduler : str, optional
         Processes or machines that evaluate the density: ``local:4``, or the address of a Dask
-        scheduler. The draws are the same.
+        scheduler. The draws are the same. With ``"nuts"`` chains run in threads of this process.
+    sampler : {"ensemble", "nuts"}
+        ``"nuts"`` is the no-U-turn sampler of nutpie, which follows the gradient: for posteriors
+        that are strongly curved or have many dimensions. It takes ``ensembles`` chains, no
+        ``walkers`` or ``weights``, and cannot resume: a run that was stopped starts over, and only
+        a complete one is kept in ``out``. The density must be a
+        :class:`~bayesoleo.posterior.LogDensity` whose problem has derivatives, or have a method
+        ``with_gradient(phi)`` that returns the log density at one point (d,) and its gradient (d,)
+        and may be called from several threads. Chains do not move between modes that are apart.
+    target_accept : float
+        Of ``"nuts"``: mean acceptance to which the step size is adapted. Larger values take
+        smaller steps, where trajectories diverge.
 
     Returns
     -------
     Samples
-        With ``reached`` False and a ``warning`` if it stopped at ``max_evaluations``.
+        With ``reached`` False and a ``warning`` if it stopped at ``max_evaluations``. With
+        ``"nuts"`` the warning also tells of trajectories that diverged.
 
     Raises
     ------
     InputError
-        If walkers are too few, or none finds a finite log density.
+        If walkers are too few, or none finds a finite log density; if there is no such sampler, or
+        the density has no gradient for it.
+    MissingExtraError
+        If nutpie is not installed.
     ResultsError
         If the folder holds another run or another process writes there.
 
@@ -217,6 +159,22 @@ def sample(
         raise InputError(
             "the effective size must be positive", key="effective_size", value=effective_size
         )
+    number = (QUICK_CLIMBS if quick else CLIMBS) if climbs is None else climbs
+    place = None if out is None else Path(out)
+    if check_sampler(sampler) == NUTS:
+        for key, value in (("walkers", walkers), ("weights", weights), ("scheduler", scheduler)):
+            if value is not None:
+                raise InputError(
+                    "does not belong to the no-U-turn sampler", key=key, value=value,
+                    hint='leave it out, or use sampler="ensemble"',
+                )  # fmt: skip
+        if quick:
+            max_evaluations = min(max_evaluations, _quick_evaluations(log_density))
+        schedule = _schedule(effective_size, max_evaluations, segment, quick)
+        return _by_nuts(
+            log_density, start, schedule, ensembles, seed, place, fingerprint, progress, quick,
+            number, target_accept,
+        )  # fmt: skip
     group = Ensembles(
         log_density, ensembles, walkers or default_walkers(dimension), weights or MoveWeights()
     )
@@ -224,13 +182,11 @@ def sample(
         most = max(_quick_evaluations(log_density), QUICK_STEPS * group.chains)
         max_evaluations = min(max_evaluations, most)
     schedule = _schedule(effective_size, max_evaluations, segment, quick)
-    number = (QUICK_CLIMBS if quick else CLIMBS) if climbs is None else climbs
     print_of_run = _fingerprint(fingerprint, group, start, seed, schedule, number)
-    place = None if out is None else Path(out)
     with open_store(place, print_of_run) as store, connected(scheduler) as client:
         if client is not None:
             group = replace(group, log_density=DistributedDensity(log_density, client))
-        bar = _Bar(schedule.effective_size, progress)
+        bar = ProgressBar(schedule.effective_size, progress)
         try:
             if not store.segments:
                 store.append(_first(group, start, seed, number, schedule))
@@ -242,6 +198,63 @@ def sample(
         finally:
             bar.close()
         return _samples(store.segments, group, quality, short, quick)
+
+
+def check_sampler(word: str) -> str:
+    """The word, if there is such a sampler.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    if word not in SAMPLERS:
+        hint = choose(word, SAMPLERS)
+        raise InputError("unknown sampler", key="sampler", value=word, hint=hint)
+    return word
+
+
+def _by_nuts(
+    log_density: Density,
+    start: Mixture,
+    schedule: Schedule,
+    chains: int,
+    seed: int,
+    place: Path | None,
+    given: str,
+    progress: bool | float,
+    quick: bool,
+    climbs: int,
+    target_accept: float,
+) -> Samples:
+    """Draws by the no-U-turn sampler; those of a complete run that was stored are read."""
+    from bayesoleo.posterior import _nuts
+
+    tune = _nuts.QUICK_TUNE if quick else _nuts.TUNE
+    schedule = _nuts.with_quick_budget(schedule, chains) if quick else schedule
+    settings = [
+        given, log_density.names, log_density.runs, chains, seed, tune, schedule.least, climbs,
+        target_accept, np.asarray(start.degrees).tolist(),
+    ]  # fmt: skip
+    if chains < 2:
+        raise InputError("agreement between chains needs two", key="ensembles", value=chains)
+    import_extra("nutpie", "nuts")
+    with _nuts.stored(place, _digest(settings, start)) as slots:
+        whole = slots.read(0)
+        trace = None if whole is None else _nuts.Trace.of(whole)
+        if trace is None or not _nuts.serves(trace, schedule):
+            bar = ProgressBar(schedule.effective_size, progress)
+            try:
+                mixture, spent = _searched(log_density, start, seed, climbs, schedule)
+                trace = _nuts.draw(
+                    log_density, mixture, schedule, chains=chains, seed=seed, tune=tune,
+                    target_accept=target_accept, bar=bar,
+                )  # fmt: skip
+            finally:
+                bar.close()
+            trace = replace(trace, warm_up=trace.warm_up + spent)
+            slots.write(0, trace.arrays())
+    return _nuts.samples_of(trace, log_density, schedule, quick=quick)
 
 
 @contextmanager
@@ -278,7 +291,6 @@ def _fingerprint(
     given: str, group: Ensembles, start: Mixture, seed: int, schedule: Schedule, climbs: int
 ) -> str:
     """Hash of all that determines the draws; a larger effective size only continues them."""
-    digest = hashlib.sha256()
     settings = [
         given,
         group.log_density.names,
@@ -293,31 +305,46 @@ def _fingerprint(
         np.asarray(start.degrees).tolist(),
         climbs,
     ]
+    return _digest(settings, start)
+
+
+def _digest(settings: list[Any], start: Mixture) -> str:
+    """Hash of settings and of the mixture of the start."""
+    digest = hashlib.sha256()
     digest.update(json.dumps(settings).encode())
     for array in (start.centres, start.covariances, start.log_weights):
-        # Rounded: the mode found on another machine differs in the last bits, and segments hold the
-        # mode that was used.
+        # Rounded: the mode found on another machine differs in the last bits, and what is stored
+        # holds the mode that was used.
         digest.update(np.array2string(array, precision=6, threshold=array.size + 1).encode())
     return digest.hexdigest()
 
 
 def _first(group: Ensembles, start: Mixture, seed: int, climbs: int, schedule: Schedule) -> Segment:
     """Walkers drawn from the start and from modes found beside it."""
-    spent = 0
-    # A climb takes about a dozen times twenty rows plus one for each coordinate.
-    climbs = min(climbs, int(SEARCHING * schedule.max_evaluations / (12 * (20 + start.dimension))))
-    if climbs > 0:
-        # A separate generator: if no mode is found, the draws are the same as without the search.
-        rng = np.random.default_rng([seed, climbs])
-        # What it looks at lies far beyond what is sampled: jumps there say nothing of that.
-        with unwatched(group.log_density):
-            most = SEARCHING * schedule.max_evaluations
-            start, spent = with_other_modes(group.log_density, start, climbs, rng, most)
+    start, spent = _searched(group.log_density, start, seed, climbs, schedule)
     first = group.start(start, seed)
     return replace(first, evaluations=first.evaluations + spent)
 
 
-def _warm_up(store: Store, group: Ensembles, schedule: Schedule, bar: _Bar, tuned: bool) -> None:
+def _searched(
+    log_density: Density, start: Mixture, seed: int, climbs: int, schedule: Schedule
+) -> tuple[Mixture, int]:
+    """The start with modes found beside it, and the rows that the search took."""
+    # A climb takes about a dozen times twenty rows plus one for each coordinate.
+    climbs = min(climbs, int(SEARCHING * schedule.max_evaluations / (12 * (20 + start.dimension))))
+    if climbs <= 0:
+        return start, 0
+    # A separate generator: if no mode is found, the draws are the same as without the search.
+    rng = np.random.default_rng([seed, climbs])
+    # What it looks at lies far beyond what is sampled: jumps there say nothing of that.
+    with unwatched(log_density):
+        most = SEARCHING * schedule.max_evaluations
+        return with_other_modes(log_density, start, climbs, rng, most)
+
+
+def _warm_up(
+    store: Store, group: Ensembles, schedule: Schedule, bar: ProgressBar, tuned: bool
+) -> None:
     """Rounds of doubling length, the mixture adapted after each, until one lasts ten times tau.
 
     Where rounds are few, the weights of the moves are tuned too, after one whose mixture missed:
@@ -329,7 +356,7 @@ def _warm_up(store: Store, group: Ensembles, schedule: Schedule, bar: _Bar, tune
         # By what is stored alone, so that a run that goes on after a stop has the same draws.
         now = replace(group, weights=_tuned(store.segments)) if missed else group
         steps = schedule.warm_up * 2**rounds
-        bar.show("warm-up", 0.0, store.segments)
+        bar.show("warm-up", 0.0, _spent(store.segments))
         store.append(now.advance(store.segments[-1], steps, "warm-up"))
 
 
@@ -337,7 +364,7 @@ def _is_warm(segments: list[Segment], schedule: Schedule) -> bool:
     rounds = [s for s in segments if s.phase == "warm-up"]
     if any(s.phase == "kept" for s in segments) or len(rounds) >= schedule.most_rounds:
         return True
-    spent = sum(s.evaluations for s in segments)
+    spent = _spent(segments)
     following = schedule.warm_up * 2 ** len(rounds) * segments[0].coords.shape[1]
     if spent + following > schedule.max_evaluations / 2:  # leave half for draws that are kept
         return True
@@ -363,35 +390,33 @@ def _independence(segment: Segment) -> float:
 
 
 def _keep(
-    store: Store, group: Ensembles, schedule: Schedule, bar: _Bar
+    store: Store, group: Ensembles, schedule: Schedule, bar: ProgressBar
 ) -> tuple[Quality, list[str]]:
     """Add segments until the criteria are met or the evaluations are used up."""
     while True:
         kept = [s for s in store.segments if s.phase == "kept"]
         done = sum(s.draws for s in kept)
-        if done in _decisions(schedule.least, done):
+        if done in decisions(schedule.least, done):
             quality = _quality(kept, group)
             short = quality.shortfalls(schedule, group.ensembles)
-            bar.show("sampling", float(quality.sizes.min()), store.segments)
+            bar.show("sampling", float(quality.sizes.min()), _spent(store.segments))
             if not short:
                 return quality, []
-        steps = min(_decisions(schedule.least, done)[-1] - done, schedule.segment)
-        spent = sum(s.evaluations for s in store.segments)
+        steps = min(decisions(schedule.least, done)[-1] - done, schedule.segment)
+        spent = _spent(store.segments)
         if spent + steps * group.chains > schedule.max_evaluations:
             return _stopped(kept, group, schedule)
         store.append(group.advance(store.segments[-1], steps, "kept"))
 
 
-def _decisions(least: int, done: int) -> list[int]:
-    """Numbers of draws at which the stopping rule is applied, up to the first after those done.
+def _spent(segments: list[Segment]) -> int:
+    """Rows of the log density so far."""
+    return sum(segment.evaluations for segment in segments)
 
-    They grow by a fifth and depend on nothing else, so that an interrupted run stops at the same
-    draw. The diagnostics, whose cost grows with the draws, are thus computed rarely.
-    """
-    numbers = [least]
-    while numbers[-1] <= done:
-        numbers.append(int(np.ceil(1.2 * numbers[-1])))
-    return numbers
+
+def _quality(kept: list[Segment], group: Ensembles) -> Quality:
+    draws = np.concatenate([s.coords for s in kept]).swapaxes(0, 1)
+    return quality_of(draws, np.repeat(np.arange(group.ensembles), group.walkers))
 
 
 def _stopped(
@@ -409,47 +434,13 @@ def _stopped(
     return quality, [f"stopped before {schedule.max_evaluations} evaluations", *short]
 
 
-def _quality(kept: list[Segment], group: Ensembles) -> Quality:
-    draws = np.concatenate([s.coords for s in kept]).swapaxes(0, 1)
-    ensemble = np.repeat(np.arange(group.ensembles), group.walkers)
-    return Quality(
-        autocorrelation_time(draws),
-        effective_size_of(draws),
-        nested_rhat(draws, ensemble),
-        draws.shape[1],
-    )
-
-
-def _every(group: Ensembles, quality: Quality, chains: int, draws: int, quick: bool) -> int:
-    """Of how many draws of a chain one is handed on; all are, unless each one costs a factorisation
-    a run, or the run is quick: every draw that is handed on is solved for once more."""
-    errors = getattr(group.log_density, "errors", None)
-    if quick:
-        # An autocorrelation time loses a quarter of the information on the quantity that moves
-        # most quickly, and less on the others. Where all draws are nearly independent, enough are
-        # left: one costs as much to hand on as three to draw.
-        most = draws // -(-ENOUGH_QUICK // chains)
-        return int(max(1, min(most, max(COSTS, quality.times.min()))))
-    if errors is None or not errors.over_runs:
-        return 1
-    # A quarter of the autocorrelation time loses a hundredth of the information at most.
-    return int(max(1, min(chains * draws // ENOUGH, quality.times.min() / 4)))
-
-
-def _sizes_of_every(quality: Quality, every: int) -> Array:
-    """Effective sizes, shape (m,), of every so many draws of chains whose correlation falls as a
-    power of the distance."""
-    correlation = np.clip((quality.times - 1) / (quality.times + 1), 0.0, 1.0)
-    apart = (1 + correlation**every) / np.maximum(1 - correlation**every, 1e-300)
-    return np.minimum(quality.sizes, quality.sizes * quality.times / (every * apart))
-
-
 def _samples(
     segments: list[Segment], group: Ensembles, quality: Quality, short: list[str], quick: bool
 ) -> Samples:
     kept = [s for s in segments if s.phase == "kept"]
     coords = np.concatenate([s.coords for s in kept]).swapaxes(0, 1)
-    every = _every(group, quality, coords.shape[0], coords.shape[1], quick)
+    errors = getattr(group.log_density, "errors", None)
+    every = stride_of(errors, quality, coords.shape[0], coords.shape[1], quick)
     # The last draw of each few, with what failed on the way to all of them.
     first = np.arange(coords.shape[1] % every, coords.shape[1], every)
     last = first + every - 1
@@ -471,10 +462,10 @@ def _samples(
         start=group.log_density.natural(segments[0].coords[0]),
         mixture=kept[-1].mixture,
         autocorrelation_time=quality.times,
-        effective_size=_sizes_of_every(quality, every),
+        effective_size=sizes_of_every(quality, every),
         rhat_nested=quality.rhat,
         acceptance=acceptance,
-        evaluations=sum(s.evaluations for s in segments),
+        evaluations=_spent(segments),
         failures=dict(sum((s.failures for s in segments), start=Counter[str]())),
         branch_jumps=sum(s.branch_jumps for s in segments),
         jumped_part=min(1.0, sum(s.branch_jumps for s in kept) / max(accepted.total(), 1)),
@@ -482,24 +473,3 @@ def _samples(
         reached=not short,
         warning="; ".join(short),
     )
-
-
-class _Bar:
-    """Progress towards the effective size."""
-
-    def __init__(self, total: float, shown: bool | float) -> None:
-        self._delay = 0.0 if shown is True else shown
-        self._bar = tqdm(
-            total=round(total), disable=not shown, unit=" effective draws", delay=self._delay
-        )
-        self._bar.set_description("warm-up", refresh=False)
-
-    def show(self, phase: str, size: float, segments: list[Segment]) -> None:
-        self._bar.set_description(phase, refresh=False)
-        self._bar.set_postfix(evaluations=sum(s.evaluations for s in segments), refresh=False)
-        self._bar.n = min(round(size), self._bar.total)
-        if self._bar.format_dict["elapsed"] >= self._delay:
-            self._bar.refresh()
-
-    def close(self) -> None:
-        self._bar.close()

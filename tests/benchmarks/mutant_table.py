@@ -335,7 +335,7 @@ POSTERIOR: Rows = {
          "return float(max(1.01, np.sqrt(1 + spread / size)))",
          "posterior/test_posterior_diagnostics.py::test_ensembles_that_agree_pass_the_limit"),
     ],
-    "posterior/_sampler.py": [
+    "posterior/_stopping.py": [
         ("sampling stops by the quickest quantity's time",
          "if self.draws < schedule.times * self.times.max():",
          "if self.draws < schedule.times * self.times.min():",

@@ -10,6 +10,9 @@ fast the loop is. Where a density solves a campaign, the loop is nothing beside 
 draws a call count. A peer's call has the gradient too. Of an oleo's campaign of 14 runs it takes
 five times as long as a density, and 25 times as long as one of the 40 that an ensemble asks for
 together (11, 2.0 and 0.43 ms).
+
+``<case>_nuts`` is our no-U-turn sampler, by nutpie with gradients of the problem's sensitivities,
+in Python: its calls count, its seconds do not compare with formulas that are compiled.
 """
 
 from __future__ import annotations
@@ -28,6 +31,8 @@ from bayesoleo.posterior._diagnostics import effective_size
 
 Array = NDArray[np.float64]
 WANTED, TUNE, DRAWS, CHAINS = 4000, 500, 2000, 2
+#: Gradients of our own no-U-turn sampler at most.
+MOST_GRADIENTS = 60_000
 
 
 def z_of(case: Case, draws: Array, size: Array) -> float:
@@ -52,17 +57,24 @@ def described(case: Case, draws: Array, used: float, calls: int) -> dict[str, fl
     }
 
 
-def ours(case: Case) -> dict[str, float]:
-    """The package's sampler."""
-    sample(case.density, case.mixture, seed=2, progress=False, quick=True)  # modules are imported
+def ours(case: Case, sampler: str = "ensemble") -> dict[str, float]:
+    """The package's sampler; ``nuts`` ends after :data:`MOST_GRADIENTS`, converged or not."""
+    given = {"progress": False, "sampler": sampler}
+    sample(case.density, case.mixture, seed=2, quick=True, **given)  # modules are imported
+    if sampler == "nuts":
+        given |= {"max_evaluations": MOST_GRADIENTS, "climbs": 0}
     used = time.process_time()
-    found = sample(case.density, case.mixture, effective_size=WANTED, seed=1, progress=False)
+    found = sample(case.density, case.mixture, effective_size=WANTED, seed=1, **given)
     used = time.process_time() - used
-    return described(case, found.draws, used, found.evaluations) | {
-        "evaluations": found.evaluations,
-        "reached": int(found.reached),
-        "cpu_s": used,
-    }
+    return (
+        described(case, found.draws, used, found.evaluations)
+        | {
+            "evaluations": found.evaluations,
+            "reached": int(found.reached),
+            "cpu_s": used,
+        }
+        | ({} if found.diverging is None else {"divergences": found.divergences})
+    )
 
 
 def starts(case: Case, back: Callable[[Array], Array]) -> Array:
@@ -148,6 +160,8 @@ def figures(name: str) -> dict[str, float]:
     case = CASES[name]()
     mine = ours(case)
     table = {f"{name}_{key}": value for key, value in mine.items()}
+    if importlib.util.find_spec("nutpie") is not None:
+        table |= {f"{name}_nuts_{key}": value for key, value in ours(case, "nuts").items()}
     others = dict(peers(case))
     for peer, found in others.items():
         table |= {f"{name}_{peer}_{key}": value for key, value in found.items()}

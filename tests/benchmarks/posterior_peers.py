@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 import time
-from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
 from posterior_cases import Case, gas_spring_case, oleo_case
 
-from bayesoleo.posterior import LogDensity
 from bayesoleo.posterior._diagnostics import autocorrelation_time, effective_size
+from bayesoleo.posterior._gradient import Gradient
 
 Array = NDArray[np.float64]
 
@@ -19,62 +18,31 @@ Array = NDArray[np.float64]
 STEPS, WALKERS = 1500, 24
 
 
-class Gradient:
-    """Log density of one vector of an oleo campaign, and its gradient by exact sensitivities.
-
-    Coordinates are whitened by the Laplace approximation, which a sampler may know before it
-    begins.
+class Whitened:
+    """The package's gradient in coordinates whitened by the Laplace approximation, which a sampler
+    may know before it begins.
 
     Parameters
     ----------
     case : Case
-        With independent errors, one variance an output.
     """
 
     def __init__(self, case: Case) -> None:
-        predictor = copy(case.density.problem.predictor)
-        predictor.jobs = 1  # chains have threads of their own
-        self.problem = copy(case.density.problem)
-        self.problem.predictor = predictor
-        self.density = LogDensity(self.problem)
         self.centre = case.mixture.centres[0]
         self.factor = np.linalg.cholesky(case.mixture.covariances[0])
-        self.data = [column[None] for column in self.problem.data]
-        self.counts = np.asarray(self.problem.counts).sum(axis=0)
+        scale = np.sqrt(np.sum(self.factor**2, axis=1))
+        self.gradient = Gradient(case.density.for_thread(), scale)  # chains have threads of theirs
         self.calls = 0
 
     def __call__(self, z: Array) -> tuple[float, Array]:
         self.calls += 1
-        phi = self.centre + self.factor @ z
-        unknowns, size = self.density.unknowns, len(self.problem.names)
-        block, log_v = phi[:size], phi[size:]
-        equations = self.problem.normal_equations(unknowns.theta(block[None]), self.data)
-        if equations.status[0] != 0:
-            raise ValueError("outside")  # nutpie takes it for a divergence
-        precision = np.exp(-log_v)
-        gradient = np.concatenate(
-            [
-                (precision @ equations.slope[0]) @ unknowns.jacobian(block),
-                -0.5 * self.counts + 0.5 * equations.sums[0] * precision,
-            ]
-        )
-        value = -0.5 * float(self.counts @ (np.log(2 * np.pi) + log_v))
-        value -= 0.5 * float(equations.sums[0] @ precision)
-        return value + self._prior(phi, gradient), self.factor.T @ gradient
-
-    def _prior(self, phi: Array, gradient: Array) -> float:
-        """Log prior; its slopes, by central differences, are added to the gradient."""
-        step = 1e-4 * np.sqrt(np.diag(self.factor @ self.factor.T))
-        shifts = np.diag(step)
-        rows = np.concatenate([phi[None], phi + shifts, phi - shifts])
-        values = self.density.log_prior(rows)
-        gradient += (values[1 : 1 + phi.size] - values[1 + phi.size :]) / (2 * step)
-        return float(values[0])
+        value, gradient = self.gradient(self.centre + self.factor @ z)
+        return value, self.factor.T @ gradient  # minus infinity is a divergence
 
 
 def gradient_error(case: Case) -> float:
     """Largest difference of the gradient from central differences of the density, whitened."""
-    at, z = Gradient(case), np.full(case.dimension, 0.3)
+    at, z = Whitened(case), np.full(case.dimension, 0.3)
     _, exact = at(z)
     rows = z + 1e-4 * np.concatenate([np.eye(z.size), -np.eye(z.size)])
     values, _ = case.density(at.centre + rows @ at.factor.T)
@@ -89,7 +57,7 @@ def nutpie_on_oleo(chains: int = 2, tune: int = 150, draws: int = 250) -> dict[s
     except ImportError:
         return {}
     case = oleo_case()
-    at = Gradient(case)
+    at = Whitened(case)
     model = from_pyfunc(
         case.dimension,
         lambda: at,

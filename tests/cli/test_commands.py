@@ -288,3 +288,25 @@ def test_whole_loop_on_a_small_campaign(run, campaign, model, tmp_path):
 @pytest.mark.parametrize("name", SCHEMES)
 def test_schemes_in_the_help_exist(name):
     assert scheme(name, (2,)) is not None
+
+
+@pytest.mark.parametrize(("given", "expected"), [([], "ensemble"), (["--sampler", "nuts"], "nuts")])
+def test_the_sampler_is_passed_on(run, campaign, model, made_up, monkeypatch, given, expected):
+    pytest.importorskip("nutpie")
+    seen = []
+
+    def noted(_, __, settings, **more):
+        seen.append(settings.sampler)
+        return made_up.oleo_tree()
+
+    monkeypatch.setattr(workflow, "sample", noted)
+    result = run("sample", campaign, "-m", model, "--quiet", *given)
+    assert result.exit_code == 0, result.output
+    assert seen == [expected]
+
+
+def test_an_unknown_sampler_names_the_known(run, campaign, model):
+    result = run("sample", campaign, "-m", model, "--sampler", "hmc")
+    assert result.exit_code == 2
+    assert "--sampler" in result.output
+    assert "ensemble, nuts" in result.output

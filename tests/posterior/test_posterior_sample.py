@@ -10,7 +10,7 @@ from posterior_targets import Banana, BentRidge, Gaussian
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._campaign_problem import CampaignProblem
-from bayesoleo.posterior import LogDensity, Mixture, _sampler, laplace_mixture, sample
+from bayesoleo.posterior import LogDensity, Mixture, _sampler, _stopping, laplace_mixture, sample
 from bayesoleo.posterior._checkpoints import REASONS
 from bayesoleo.posterior._datatree import choose_all
 from bayesoleo.posterior._diagnostics import effective_size
@@ -163,15 +163,15 @@ def test_a_quick_run_hands_on_draws_that_tell_something_new():
     within_error(few, np.zeros(8), sd)
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.9])
+@pytest.mark.parametrize("correlation", [-0.4, 0.0, 0.3, 0.9])
 @pytest.mark.parametrize("every", [1, 3, 10])
 def test_the_effective_size_of_every_few_draws_is_that_of_their_correlation(correlation, every):
     """An autoregression of first order, whose thinned chain is one too."""
     time = (1 + correlation) / (1 - correlation)
-    quality = _sampler.Quality(np.array([time]), np.array([6000 / time]), np.ones(1), 100)
+    quality = _stopping.Quality(np.array([time]), np.array([6000 / time]), np.ones(1), 100)
     thinned = (1 + correlation**every) / (1 - correlation**every)
-    exact = 6000 / every / thinned
-    assert _sampler._sizes_of_every(quality, every) == pytest.approx(exact, rel=1e-12)
+    exact = min(6000 / every / thinned, 6000 / time)
+    assert _stopping.sizes_of_every(quality, every) == pytest.approx(exact, rel=1e-12)
 
 
 def test_a_quick_run_hands_on_enough_of_draws_that_are_nearly_independent():
