@@ -370,7 +370,8 @@ def _as_judged(tree: xr.DataTree, record: Record, run: _Run, model: Model) -> _R
 def _sd_of(output: str, known: Known, record: Record) -> Array:
     """Noise of an output; of one that was not fitted, what the record itself shows."""
     number = len(next(iter(known.sd.values())))
-    return known.sd.get(output, np.full(number, record.signal_noise.get(output, 0.0)))
+    shown = float(np.nan_to_num(record.signal_noise.get(output, 0.0)))
+    return known.sd.get(output, np.full(number, shown))
 
 
 def _dataset(model: Model, records: Sequence[Record], found: Sequence[_Run]) -> xr.Dataset:

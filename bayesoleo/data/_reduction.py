@@ -20,7 +20,13 @@ from bayesoleo.data._campaign import CampaignData
 from bayesoleo.data._fourier import HarmonicBasis
 from bayesoleo.data._harmonics import significant_harmonics, within_bandwidth
 from bayesoleo.data._held_inputs import between_samples, held_harmonics
-from bayesoleo.data._noise import average_on, innovation_noise, periodic_average
+from bayesoleo.data._noise import (
+    average_on,
+    innovation_noise,
+    jumps,
+    periodic_average,
+    scatter_about_levels,
+)
 from bayesoleo.data._residual_time_shift import Frequency, find_frequency
 from bayesoleo.data._run_samples import Run
 from bayesoleo.data._sample_quality import (
@@ -36,6 +42,9 @@ from bayesoleo.prediction._band_limited import band_limited_channels, sample_noi
 from bayesoleo.prediction._records import Harmonics, Record
 
 Method = Literal["band-limited", "linear"]
+
+#: Differences between samples of a command tell its noise up to this part of its deviation.
+MOST_NOISE = 0.3
 
 
 def on_grid(
@@ -293,7 +302,7 @@ def _transient(run: Run) -> Record:
         periods=0,
         harmonics={},
         signal_noise={
-            name: min(innovation_noise(x[~away]), sample_noise(values, step))
+            name: _transient_noise(x[~away], sample_noise(values, step), name in run.held)
             for (name, x), values in zip(run.samples.items(), whole, strict=True)
         },
         smoothed=band_limited_channels(
@@ -307,3 +316,21 @@ def _transient(run: Run) -> Record:
         ),
         kept=~away if away.any() else None,
     )
+
+
+def _transient_noise(values: Array, floor: float, held: bool) -> float:
+    """Standard deviation of a transient's sample; not a number where nothing tells it.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        Samples that count.
+    floor : float
+        By the lowest part of the spectrum.
+    held : bool
+        Whether a controller holds the channel from one sample to the next: what changes at every
+        sample is then its command, and differences say nothing of noise.
+    """
+    found = min(innovation_noise(values), floor, scatter_about_levels(values))
+    smooth = found <= MOST_NOISE * float(np.std(values))
+    return found if smooth or not held or jumps(values).any() else float("nan")

@@ -114,7 +114,7 @@ def moving_inputs(
 def _moves(records: Sequence[Record], name: str) -> bool:
     values = [record.samples[name] for record in records]
     size = max(float(np.abs(one).max()) for one in values)
-    noise = max(record.signal_noise.get(name, 0.0) for record in records)
+    noise = float(np.fmax.reduce([0.0, *(r.signal_noise.get(name, 0.0) for r in records)]))
     swing = max(float(np.std(one)) for one in values)
     return swing > max(CONSTANT * size, 2.0 * noise)
 
