@@ -34,6 +34,7 @@ from bayesoleo.effects._catalogue import (
     with_titles,
 )
 from bayesoleo.effects._nonparametric import FAMILY
+from bayesoleo.errors import number_of
 from bayesoleo.plots._discovery import chosen, format_p, format_probability, format_share, name
 from bayesoleo.plots._style import Scale, format_value
 
@@ -97,7 +98,7 @@ def _not_tried(summary: Mapping[str, Any]) -> str:
     left_out = summary.get("effects_left_out", 0)
     if not left_out or not summary["effects"]:
         return ""
-    return f" The search was not given {left_out} other effects of the catalogue."
+    return f" The search was not given {number_of(left_out, 'other effect')} of the catalogue."
 
 
 def _said(summary: Mapping[str, Any]) -> str:
@@ -385,7 +386,7 @@ def runs_used(summary: Mapping[str, Any]) -> str:
 
 
 def _runs(labels: list[str]) -> str:
-    number = f"{len(labels)} run{'s' if len(labels) > 1 else ''}"
+    number = number_of(len(labels), "run")
     return f"{number} ({', '.join(labels)})" if len(labels) <= MOST_LABELS else number
 
 
@@ -442,7 +443,11 @@ def stability(summary: Mapping[str, Any]) -> str:
         if len(known) > 1
         else "The periodic solution is stable"
     )
-    went = f" Solutions changed branch or stability {jumps} times on the way." if jumps else ""
+    went = (
+        f" Solutions changed branch or stability {number_of(jumps, 'time')} on the way."
+        if jumps
+        else ""
+    )
     return f"{text}; {end}.{went}"
 
 
@@ -484,7 +489,7 @@ def _above_floor(output: str, runs: Mapping[str, Any], than: str) -> str:
         return f"The noise of {output} is not known in any run: only the rms of the residual is."
     worst = max(known, key=lambda run: known[run])
     above = sum(too_large(runs[run]) for run in known)
-    lead = "No run" if above == 0 else f"{above} of {len(known)} runs"
+    lead = "No run" if above == 0 else f"{above} of {number_of(len(known), 'run')}"
     verb = "has" if above <= 1 else "have"
     largest = f"the largest is {format_ratio(known[worst])} times {than}, in {worst}"
     return f"{lead} {verb} an error of {output} beyond what chance allows; {largest}."
@@ -573,7 +578,8 @@ def response_sentence(entry: Mapping[str, Any]) -> str:
     """
     size = format_value(entry["input_rms"], entry["drive_unit"])
     low, high = (f"{one:.3g}" for one in entry["band"])
-    many = f"{entry['realisations']} realisation" + "s" * (entry["realisations"] > 1)
+    many = number_of(entry["realisations"], "realisation")
+    lines = number_of(entry["lines"], "excited line")
     shown = [
         f"{kind} distortion {_times_noise(sizes)}" for kind, sizes in entry["distortion"].items()
     ]
@@ -585,8 +591,8 @@ def response_sentence(entry: Mapping[str, Any]) -> str:
     if share is not None and share >= _INPUT_SHARE:
         shown.append(f"the input has {100 * share:.2g} % of its amplitude at unexcited lines too")
     return (
-        f"from {entry['drive']} to {entry['output']} at {size} rms ({many}, {entry['lines']} "
-        f"excited lines from {low} to {high} Hz): {'; '.join(shown)}"
+        f"from {entry['drive']} to {entry['output']} at {size} rms ({many}, "
+        f"{lines} from {low} to {high} Hz): {'; '.join(shown)}"
     )
 
 

@@ -35,7 +35,7 @@ from bayesoleo.discovery._fit import weights
 from bayesoleo.discovery._fit_and_hold_out_error import compared
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._run_predictions import Prediction
-from bayesoleo.errors import InputError, check_level
+from bayesoleo.errors import InputError, check_level, number_of
 from bayesoleo.estimation._baselines import (
     Baseline,
     added_text,
@@ -460,7 +460,10 @@ def forecast_text(data: xr.Dataset) -> str:
                 f"{one['ratio_to_expected']:.2f}",
             ]
             rows.append([str(output), str(run), *cells])
-    lines = [columns(head, rows), f"{data.attrs['draws']} draws of {data.attrs['model']}"]
+    lines = [
+        columns(head, rows),
+        f"{number_of(data.attrs['draws'], 'draw')} of {data.attrs['model']}",
+    ]
     lines += [str(data.attrs[key]) for key in (ADDED, REMOVED) if data.attrs.get(key)]
     for run in data[schema.RUN].values:
         failed = json.loads(str(data["failed"].sel(run=run).values))
