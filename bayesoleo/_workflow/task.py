@@ -40,6 +40,7 @@ from bayesoleo.data._held_inputs import count_steps
 from bayesoleo.data._reduction import ReducedCampaign, reduce_campaign
 from bayesoleo.discovery._assembly import Assembly, Roles, assign
 from bayesoleo.discovery._fit import ModelFit
+from bayesoleo.effects._catalogue import listed
 from bayesoleo.errors import CampaignError, DataWarning, InputError, ModelError
 from bayesoleo.estimation._nuisance import declared_nuisance
 from bayesoleo.model._derivatives import derive
@@ -376,7 +377,11 @@ def prepare(
     _check_units(driven, reduced.campaign)
     _check_held(driven, reduced)
     reduced = within_bands(reduced, driven)
-    for sentence in (*stepped_inputs(reduced, driven), *velocities_without_place(driven)):
+    for sentence in (
+        *drive_not_followed(model, reduced.campaign, settings.drive),
+        *stepped_inputs(reduced, driven),
+        *velocities_without_place(driven),
+    ):
         warnings.warn(sentence, DataWarning, stacklevel=2)
     return Task(reduced, assign(reduced.records), assembly, settings)
 
@@ -583,6 +588,37 @@ def choose_drive(model: Model, campaign: CampaignData, wanted: str | None) -> st
     if controlled is None or controlled in model.inputs or controlled not in possible_drives(model):
         return None
     return controlled
+
+
+def drive_not_followed(model: Model, campaign: CampaignData, wanted: str | None) -> list[str]:
+    """A sentence on a controlled channel that cannot drive a model; none where nothing is amiss.
+
+    It is no error: a campaign is there for several models.
+
+    Parameters
+    ----------
+    model : Model
+        In its own drive.
+    campaign : CampaignData
+    wanted : str or None
+        The setting ``drive``, which leaves nothing to say.
+    """
+    controlled, possible = campaign.controlled, possible_drives(model)
+    if wanted is not None or controlled is None or controlled in possible:
+        return []
+    why = (
+        f"which is an output of model {model.name!r} that no input can be exchanged for"
+        if controlled in model.outputs
+        else f"which is neither an input nor an output of model {model.name!r}"
+    )
+    own = listed(list(model.inputs)) or "no input at all"
+    measured = [name for name in possible if name in campaign.channels]
+    instead = f"one of: {', '.join(measured)}" if measured else "none of the channels"
+    return [
+        f"campaign.toml says controlled = {controlled!r}, {why}: the model is driven by {own}."
+        f" It can be driven by {instead}. If its own inputs are meant, say so by --drive model or,"
+        " in Python, drive='model'"
+    ]
 
 
 def check(campaign: Source, model: Model, settings: Settings = Settings()) -> dict[str, Any]:

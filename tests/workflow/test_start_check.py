@@ -10,10 +10,15 @@ from small_campaigns import damper, damper_campaign
 
 from bayesoleo import Campaign, _workflow as workflow
 from bayesoleo._workflow.settings import Settings
-from bayesoleo._workflow.task import StartCheck, about_start, velocities_without_place
+from bayesoleo._workflow.task import (
+    StartCheck,
+    about_start,
+    drive_not_followed,
+    velocities_without_place,
+)
 from bayesoleo.data import CampaignData
 from bayesoleo.errors import DataWarning, ModelError
-from bayesoleo.model import Model, Output, Parameter
+from bayesoleo.model import Dof, Model, Output, Parameter
 from bayesoleo.prediction import RunPlan, motion
 from bayesoleo.systems import system
 
@@ -160,3 +165,42 @@ def test_friction_is_not_looked_for_at_a_velocity_without_place(unit, told):
     found = velocities_without_place(model)
     assert len(found) == told
     assert all("dof speed" in text and "no friction" in text for text in found)
+
+
+@pytest.mark.parametrize(
+    ("controlled", "told"),
+    [
+        ("displacement", ""),  # its own input
+        (None, ""),
+        ("force", "an output of model 'rotor' that no input can be exchanged for"),
+        ("torque", "neither an input nor an output of model 'rotor'"),
+    ],
+)
+def test_a_controlled_channel_that_cannot_drive_is_told(campaign, controlled, told):
+    # Its only output does not depend on the motion: no displacement belongs to it.
+    model = replace(rotor("+ pull*place"), outputs={"force": Output("pull", "N")})
+    found = drive_not_followed(model, replace(campaign, controlled=controlled), None)
+    assert len(found) == bool(told)
+    for text in found:
+        assert f"controlled = '{controlled}', which is {told}" in text
+        assert "driven by displacement. It can be driven by one of: displacement." in text
+    assert drive_not_followed(model, replace(campaign, controlled=controlled), "model") == []
+
+
+def test_an_output_that_can_be_exchanged_drives_without_a_word(campaign):
+    spring = Model(
+        "spring",
+        inputs={"force": "N"},
+        dofs={"x": "m"},
+        parameters={"stiffness": Parameter(1e4, "N/m", relative_sd=0.5)},
+        equations={"x": "ddot(x) + stiffness*x - force"},
+        outputs={"displacement": Output("x", "m")},
+    )
+    assert drive_not_followed(spring, replace(campaign, controlled="displacement"), None) == []
+
+
+def test_a_campaign_warns_of_a_controlled_channel_that_cannot_drive(campaign):
+    wrong = replace(campaign, controlled="force")
+    model = rotor("+ pull*place")  # of which the force follows the velocity
+    with pytest.warns(DataWarning, match=r"controlled = 'force'.*driven by displacement"):
+        workflow.check(wrong, model, Settings(jobs=1))
