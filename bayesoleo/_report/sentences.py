@@ -24,7 +24,7 @@ from bayesoleo._report.tables import (
 )
 from bayesoleo.data import _frequency_response as response
 from bayesoleo.discovery._policy import SearchPolicy
-from bayesoleo.discovery._work import ENDED
+from bayesoleo.discovery._work import ENDS
 from bayesoleo.effects._catalogue import (
     PROPER,
     called,
@@ -88,9 +88,9 @@ def headline_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
 def _ended_early(summary: Mapping[str, Any]) -> str:
     """A sentence on a quick search that went no further; empty of any other."""
     last = summary["rounds"][-1] if summary["rounds"] else {}
-    if last.get("reason") != ENDED:
+    if not str(last.get("reason", "")).startswith(ENDS):
         return ""
-    return " The quick search ended there: without --quick it goes on."
+    return " The quick search ended there: without --quick (in Python quick=False) it goes on."
 
 
 def _not_tried(summary: Mapping[str, Any]) -> str:

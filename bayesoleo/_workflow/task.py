@@ -20,7 +20,7 @@ import xarray as xr
 from bayesoleo import _schema as schema
 from bayesoleo._compiled import is_compiled
 from bayesoleo._parallel import available_cores, thread_limit
-from bayesoleo._units import base_unit, parse_unit, same_quantity
+from bayesoleo._units import angle_hint, base_unit, parse_unit, same_quantity
 from bayesoleo._worker_processes import begin_elsewhere
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.data._campaign import CampaignData, load_campaign
@@ -553,7 +553,8 @@ def _check_units(model: Model, campaign: CampaignData) -> None:
                 file=campaign.path / "campaign.toml",
                 key=f"channels.{name}.unit",
                 value=channel.unit,
-                hint=f"write a unit that converts to {unit}, or declare the model otherwise",
+                hint=angle_hint(channel.unit, wanted.name)
+                or f"write a unit that converts to {unit}, or declare the model otherwise",
             )
 
 
@@ -565,6 +566,11 @@ def _check_held(model: Model, reduced: ReducedCampaign) -> None:
     expressions = [*map(model.equation, model.dofs), *map(model.output, model.outputs)]
     for dof in model.dofs:
         if not any(model.expand(one).has(symbol(dof)) for one in expressions):
+            instead = (
+                "declare its rate as a dof of first order, at which no friction is looked for"
+                if model.order(dof) > 1
+                else f"leave {dof!r} out and solve its equation for dot({dof}), to write that there"
+            )
             raise ModelError(
                 f"model {model.name!r}: nothing holds {dof!r}. Only its derivatives are in"
                 " equations and outputs, so that its place is unknown in a periodic run such as"
@@ -572,8 +578,7 @@ def _check_held(model: Model, reduced: ReducedCampaign) -> None:
                 key="dofs",
                 value=dof,
                 hint="declare all runs as transients (kind = 'transient') that begin at"
-                f" Dof({model.dofs[dof].unit!r}, initial='0'); or its rate as a dof of first order,"
-                " at which no friction is looked for",
+                f" Dof({model.dofs[dof].unit!r}, initial='0'); or {instead}",
             )
 
 

@@ -116,8 +116,12 @@ def test_a_quick_search_that_went_no_further_says_so(names):
     summary = summary_of(names, sure, ratio=3.0, verdict=schema.UNEXPLAINED)
     summary["rounds"] = [*summary["rounds"][:-1], {**summary["rounds"][-1], "reason": ENDED}]
     text = headline(summary)
-    assert text == f"{plain} The quick search ended there: without --quick it goes on."
-    assert headline_parts(summary)[1].endswith("without --quick it goes on.")
+    on = "without --quick (in Python quick=False) it goes on."
+    assert text == f"{plain} The quick search ended there: {on}"
+    assert headline_parts(summary)[1].endswith(on)
+    # Results of earlier versions have the reason in other words after the semicolon.
+    summary["rounds"][-1]["reason"] = "a quick search goes no further; without --quick it looks"
+    assert headline(summary) == text
 
 
 def test_a_run_that_alone_is_too_large_is_named():
