@@ -23,6 +23,7 @@ from bayesoleo._report.tables import (
     words,
 )
 from bayesoleo.data import _frequency_response as response
+from bayesoleo.discovery._inference import MORE, NO_MORE
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._work import ENDS
 from bayesoleo.effects._catalogue import (
@@ -37,6 +38,9 @@ from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.errors import number_of
 from bayesoleo.plots._discovery import chosen, format_p, format_probability, format_share, name
 from bayesoleo.plots._style import Scale, format_value
+
+#: Said of errors that two judgements put on either side of what chance allows.
+_AT_THE_LIMIT = "the error in the fitted runs is at the limit of what chance allows"
 
 
 def role_shown(summary: Mapping[str, Any]) -> str:
@@ -111,6 +115,8 @@ def _said(summary: Mapping[str, Any]) -> str:
     likely = structures.with_probability(summary)
     outside = structures.outside_acts(summary, structures.of_set(summary))
     down = f"the error is then down to {words(summary)}"
+    if any(map(too_large, _errors_of(summary))):
+        down = f"but {_size_left(summary)}"
     if sure == schema.CERTAIN:
         return f"Certain: {found} {was} missing{likely}; {down}.{structures.next_best(summary)}"
     if sure == schema.PROBABLE:
@@ -140,7 +146,9 @@ def named_in_part(summary: Mapping[str, Any]) -> bool:
 def _nothing_added(summary: Mapping[str, Any]) -> str:
     """The result where no effect was added."""
     found = structures.known(summary)
-    if summary["verdict"] == schema.NOTHING_MISSING:
+    if summary["verdict"] == schema.NOTHING_MISSING and not any(
+        map(too_large, _errors_of(summary))
+    ):
         explains = f"the model explains the measurements down to {words(summary)}"
         if found is None:
             return f"Nothing is missing: {explains}."
@@ -400,11 +408,40 @@ def error_model(attributes: Mapping[Any, Any], summary: Mapping[str, Any]) -> st
     summary : mapping
         As in ``summary.json``; its titles are used.
     """
-    why = str(attributes.get(schema.ERROR_MODEL_REASON, ""))
+    why = _agreeing(str(attributes.get(schema.ERROR_MODEL_REASON, "")), summary)
     if why:
         return f"{begin(with_titles(why, catalogue_titles() | titles(summary)))}."
     word = str(attributes.get("error_model", ""))
     return f"The intervals assume {word} errors." if word else ""
+
+
+def _agreeing(why: str, summary: Mapping[str, Any]) -> str:
+    """The reason for an error model, where the errors of the search are judged alike.
+
+    They are judged together with the hold-out runs, so that one at the limit of chance may be
+    within it for one of the two and beyond it for the other.
+    """
+    large = any(map(too_large, _errors_of(summary, schema.FIT)))
+    if NO_MORE in why:
+        return why.replace(NO_MORE, _AT_THE_LIMIT) if large else why
+    return why if large else why.replace(MORE, _AT_THE_LIMIT)
+
+
+def _errors_of(summary: Mapping[str, Any], role: str | None = None) -> list[Mapping[str, Any]]:
+    """Errors of the final model, of each output over all runs of a role and in each run."""
+    pooled = [
+        errors
+        for one, outputs in summary["error_after"].items()
+        for errors in outputs.values()
+        if role in (None, one)
+    ]
+    single = [
+        errors
+        for runs in summary["rounds"][-1].get("error", {}).values()
+        for errors in runs.values()
+        if role in (None, errors.get("role", role))
+    ]
+    return [*pooled, *single]
 
 
 def reason(entry: Mapping[str, Any], known: Mapping[str, str] | None = None) -> str:
