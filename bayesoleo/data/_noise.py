@@ -122,13 +122,22 @@ def jumps(values: Array) -> NDArray[np.bool_]:
     right before and after it. So neither an outlier is one, which returns at once, nor a pulse, nor
     a burst of noise, nor the fast part of a sweep: they have large changes side by side. Where most
     large changes stand alone like that, the others are jumps in quick succession. Steps of a
-    converter's digits are none.
+    converter's digits are none. A jump of the slope counts too, at the interval after it: what
+    follows an input that is switched has one.
 
     Parameters
     ----------
     values : ndarray, shape (N,)
         Signal at equidistant times.
     """
+    digit = step_of(values)
+    found = _jumps(values, digit)
+    found[1:] |= _jumps(np.diff(values), digit)
+    return found
+
+
+def _jumps(values: Array, digit: float) -> NDArray[np.bool_]:
+    """Intervals of jumps that exceed so many digits of a converter."""
     size = np.abs(np.diff(values))
     none = np.zeros(size.size, dtype=bool)
     if size.size < 2 * HIGHEST_DIFFERENCE:
@@ -136,7 +145,7 @@ def jumps(values: Array) -> NDArray[np.bool_]:
     usual = _usual(size)
     if not size.max() * LONGEST_JUMP > JUMP * usual:  # nor where they are not finite
         return none
-    least = JUMP * max(usual, step_of(values))
+    least = JUMP * max(usual, digit)
     # Noise that neighbours of a jump may show: of the fourth differences, which see no slope.
     slack = 3.0 * _usual(np.abs(np.diff(values, 4))) * np.sqrt(2.0 / comb(8, 4))
     alone = np.logical_or.reduce(

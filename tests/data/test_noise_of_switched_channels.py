@@ -47,6 +47,9 @@ JUMPING = {
         [1, -1], [1, -0.97], switched(rng, [0.0, 5.0], 0.01)
     ),
     "friction": force_with_friction,
+    "charge behind a switch": lambda rng: lfilter(
+        [0.04], [1, -0.96], switched(rng, [0.0, 20.0], 0.01)
+    ),
 }
 OTHERS = {
     "sine": lambda rng: np.sin(TIME / 32),

@@ -19,7 +19,7 @@ SEVERAL = {
     "({len(values)} runs)",
     "first {MOST_PANELS} of {len(runs)} runs",
 }
-COUNTED = re.compile(r"\{len\([^{}]*\)\} [a-z]+s\b")
+COUNTED = re.compile(r"\{len\([^{}]*\)\}(?: [a-z-]+){0,2} [a-z-]+s\b")
 
 
 @pytest.mark.parametrize(
