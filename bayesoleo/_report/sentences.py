@@ -86,7 +86,8 @@ def headline_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
     rest = text[first:].lstrip(",;. ")
     subject = "It explains" if len(summary["effects"]) == 1 else "They explain"
     # A title of its own leaves its participle without a sentence.
-    return f"{text[:first]}.", begin(re.sub("^explaining", subject, rest))
+    rest = re.sub("^explaining", subject, rest)
+    return f"{text[:first]}.", begin(re.sub("^(and|but) ", "", rest))
 
 
 def _ended_early(summary: Mapping[str, Any]) -> str:

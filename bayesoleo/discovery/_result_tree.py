@@ -443,7 +443,12 @@ def _coordinate(loop: ClosedLoop) -> dict[str, tuple[list[Array], str, str]]:
         position.append(item.evaluate(record.position, record.rate))
         velocity.append(item.evaluate(record.position, record.rate, 1))
     return {
-        schema.STROKE: (position, unit, f"position of {place.name}"),
+        # A dof that is called position has no position of its own.
+        schema.STROKE: (
+            position,
+            unit,
+            place.name if place.name == "position" else f"position of {place.name}",
+        ),
         schema.VELOCITY: (velocity, f"{unit}/s" if unit else "1/s", f"velocity of {place.name}"),
     }
 

@@ -218,13 +218,14 @@ def test_the_title_of_a_page_is_short_and_nothing_is_lost(sure, count):
         summary = summary_of(names, sure, ratio=2.0, verdict=verdict, alike=["play @ x"])
         title, rest = headline_parts(summary)
         whole = headline(summary)
-        assert not rest.startswith("Explaining")
+        assert not rest.startswith(("Explaining", "And", "But"))
         whole = whole.replace(
             ", explaining", f", {'It explains' if count == 1 else 'They explain'}"
         )
         assert whole.startswith(title[:-1])
         assert whole.endswith(rest[1:])
-        assert len(title) + len(rest) >= len(whole) - 2
+        # No more than a conjunction between the two is left out.
+        assert len(title) + len(rest) >= len(whole) - len(", and ")
         assert len(title) < 110 + 45 * count
         assert title.endswith(".")
 
@@ -285,3 +286,10 @@ def test_headline_and_errors_say_one_thing(why, sure, verdict, pooled, single, r
     # Both are said where nothing speaks against it.
     assert none == (why in ("white", "inputs") and not (large and role == schema.FIT))
     assert more == (why == "beyond" and large and role == schema.FIT)
+
+
+@pytest.mark.parametrize("verdict", [schema.EFFECT_ADDED, schema.UNEXPLAINED])
+@pytest.mark.parametrize("sure", schema.CERTAINTIES)
+def test_the_rest_of_a_headline_begins_without_a_conjunction(sure, verdict):
+    summary = summary_of(["coulomb_friction @ x"], sure, ratio=3.0, verdict=verdict)
+    assert headline_parts(summary)[1].startswith(("The error of force", "It explains most of"))

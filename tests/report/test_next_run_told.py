@@ -54,6 +54,11 @@ def test_what_is_told_of_the_best_run_is_what_it_was_ranked_by():
     assert "more than 0.50" in proposal_lines(given)[1]
 
 
+def test_a_repetition_that_tells_as_much_is_told_as_such():
+    given = entry(repeat=trial({("a", "b"): 9.0}, 0.02, "run 3", 0.899))
+    assert proposal_lines(given)[1].endswith("; run 3, made once more, as much.")
+
+
 def test_a_repetition_that_tells_more_than_any_new_run_is_told_first():
     line = proposal_lines(entry(repeat=trial({("a", "b"): 9.0}, 0.02, "run 3", 0.95)))[1]
     assert line.startswith("run 3, made once more, is expected to tell 0.95 bits")
