@@ -69,7 +69,6 @@ def innovation_noise(values: Array, kept: NDArray[np.bool_] | None = None) -> fl
 
     Differences of order d remove a local polynomial of degree d - 1 and leave noise with variance
     ``binomial(2 d, d)`` times that of a sample. The order grows until the estimate stops falling.
-    Differences across a jump of the signal do not count, see :func:`jumps`.
 
     Parameters
     ----------
@@ -84,11 +83,30 @@ def innovation_noise(values: Array, kept: NDArray[np.bool_] | None = None) -> fl
     float
         In the signal's unit.
     """
-    for counted, jumped in ((kept, jumps(values)), (kept, None), (None, None)):
-        found = _from_differences(values, counted, jumped)
-        if found is not None:
-            return found
-    return np.inf
+    found = _from_differences(values, kept, None)
+    if found is None:
+        found = _from_differences(values, None, None)
+    return np.inf if found is None else found
+
+
+def noise_beside_jumps(values: Array) -> float:
+    """The same of a signal with jumps: differences across these do not count, see :func:`jumps`.
+
+    The search for missing effects does without: where a prediction jumps too, an error of when it
+    does would stand beside a noise that knows of no jump.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        Signal at equidistant times.
+
+    Returns
+    -------
+    float
+        In the signal's unit.
+    """
+    found = _from_differences(values, None, jumps(values))
+    return innovation_noise(values) if found is None else found
 
 
 def _from_differences(
