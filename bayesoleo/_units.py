@@ -65,6 +65,14 @@ _COMMON = (
 #: Absolute and gauge pressure as rigs write them besides: bar(a), psi (g), bar abs.
 _PRESSURE = re.compile(r"(bar|psi)\s*(?:\(\s*([ag])\s*\)|\s(a)bs|\s(g)auge)\.?", re.IGNORECASE)
 
+#: Units of events in a time, as those of turns and of radians.
+_OF_EVENTS = {
+    "1/min": ("rpm", "rad/min"),
+    "min**-1": ("rpm", "rad/min"),
+    "Hz": ("rev/s", "rad/s"),
+    "1/s": ("rev/s", "rad/s"),
+}
+
 _lock = threading.Lock()
 
 
@@ -291,6 +299,37 @@ def _holds_force(unit: Any) -> bool:
 def same_quantity(first: str, second: str) -> bool:
     """Whether two SI units measure the same, as far as units tell: a torque may be called J."""
     return first == second or {first, second} == {_ENERGY, TORQUE}
+
+
+def angle_hint(given: str, wanted: str) -> str:
+    """What to write where one unit is an angle in a time and the other one events in a time.
+
+    ``1/min`` does not say whether its events are turns, of ``2*pi`` rad each.
+
+    Parameters
+    ----------
+    given, wanted : str
+        Units that are known: of a channel and of what a model takes.
+
+    Returns
+    -------
+    str
+        Empty where the units differ by something else.
+    """
+    kinds = parse_unit(given).si_name, parse_unit(wanted).si_name
+    if kinds == ("Hz", "rad/s"):
+        unit = given.replace(" ", "")
+        turns, radians = _OF_EVENTS.get(unit, (f"rev*({unit})", f"rad*({unit})"))
+        return (
+            f"{given} counts events, {wanted} measures an angle: write unit = {turns!r} if each"
+            f" event is a turn of 2*pi rad, {radians!r} if it is a radian"
+        )
+    if kinds == ("rad/s", "Hz"):
+        return (
+            f"{given} measures an angle, {wanted} counts events: declare the model in rad/s, and"
+            " divide by 2*pi in its equations where they count turns"
+        )
+    return ""
 
 
 def check_kind(name: str, unit: Unit) -> None:

@@ -120,6 +120,20 @@ def choose(wrong: object, allowed: Iterable[object], most: int = 1) -> str:
     return f"did you mean {' or '.join(close)}?" + (f" {listed}" if len(names) <= FEW else "")
 
 
+def number_of(count: int, one: str, many: str = "") -> str:
+    """A count with its noun, in the number that it asks for: ``1 run``, ``2 runs``.
+
+    Parameters
+    ----------
+    count : int
+    one : str
+        The noun for one.
+    many : str, optional
+        For none and several, where that is not the same with an s.
+    """
+    return f"{count} {one if count == 1 else many or one + 's'}"
+
+
 def memory_text(error: MemoryError) -> str:
     """What is told where memory runs out, in one line."""
     asked = " ".join(str(error).split())

@@ -27,6 +27,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from bayesoleo.effects._catalogue import called
+from bayesoleo.errors import number_of
 from bayesoleo.plots._discovery import chosen
 from bayesoleo.plots._style import engineering, format_number
 
@@ -223,7 +224,7 @@ def print_added(summary: Mapping[str, Any]) -> None:
     for effect, names in added_parameters(summary):
         print(effect)
         if len(names) > MOST_NAMES:  # such as the values of a spline
-            print(f"  {len(names)} parameters")
+            print(f"  {number_of(len(names), 'parameter')}")
             continue
         for name in names:
             print(_line(name, summary["parameters"][name]))

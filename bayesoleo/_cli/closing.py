@@ -14,7 +14,7 @@ import typer
 from bayesoleo import _schema as schema
 from bayesoleo._cli import options, shell
 from bayesoleo._workflow.settings import Settings, words
-from bayesoleo.errors import InputError, UnfinishedError
+from bayesoleo.errors import InputError, UnfinishedError, number_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -474,7 +474,9 @@ def _print_tasks(found: EachResult) -> None:
     for task in found.failed:
         shell.say(f"failed    {task.folder}: {task.reason}")
     done = len(found.tasks) - len(found.failed)
-    shell.say(f"{done} of {len(found.tasks)} tasks are done")
+    shell.say(
+        f"{done} of {number_of(len(found.tasks), 'task')} {'is' if done == 1 else 'are'} done"
+    )
     for name in ("manifest.json", "summary.csv"):
         shell.say(f"written   {found.folder / name}")
 

@@ -143,7 +143,8 @@ def _channels(
     cells: list[list[Any]] = [[run["run"]] for run in runs]
     for name, channel in reduced.campaign.channels.items():
         noise = [run["channels"][name]["noise"] for run in runs]
-        scale = engineering(channel.si_unit, sorted(noise)[len(noise) // 2])
+        known = sorted(level for level in noise if math.isfinite(level)) or [math.nan]
+        scale = engineering(channel.si_unit, known[len(known) // 2])
         head.append(f"{name} [{scale.unit or '1'}]")
         for row, run, level in zip(cells, runs, noise, strict=True):
             harmonics = run["channels"][name]["harmonics"]
@@ -153,7 +154,10 @@ def _channels(
 
 
 def _three_digits(value: float) -> str:
-    """Three digits or a few more, but no power of ten beside numbers without one."""
+    """Three digits or a few more, but no power of ten beside numbers without one; a dash where
+    there is no number."""
+    if not math.isfinite(value):
+        return "–"
     return f"{value:.0f}" if 999 < value < 1e5 else f"{value:.3g}"
 
 

@@ -35,7 +35,7 @@ from bayesoleo._worker_processes import process_map
 from bayesoleo.assessment._residual_breakdown import GROUP, ORDERS, RUN, residual_breakdown
 from bayesoleo.effects._catalogue import called, listed, parameter_called
 from bayesoleo.effects._nonparametric import FAMILY
-from bayesoleo.errors import InputError, ResultsError
+from bayesoleo.errors import InputError, ResultsError, number_of
 from bayesoleo.plots import _reading as reading
 from bayesoleo.plots._discovery import chosen, format_share, name
 from bayesoleo.plots._residuals import has_excess
@@ -91,7 +91,7 @@ def _wrong(summary: Mapping[str, Any]) -> str:
     what = f"the largest is the error of {output} in {in_run(run)}, {times}"
     if not above:
         return f"No: no error is larger than chance allows; {what}."
-    of = f"{above} of {len({run for *_, run in errors})} runs"
+    of = f"{above} of {number_of(len({run for *_, run in errors}), 'run')}"
     return f"In {of} an error is larger than chance allows; {what}."
 
 
@@ -145,11 +145,8 @@ def _what(summary: Mapping[str, Any]) -> Iterator[str]:
             continue
         p = sentences.significance(added)
         text = f"{which} explains {_share(added)} of the excess"
-        text += (
-            f" ({p}, corrected for the search of {len(entry['candidates'])} candidates)"
-            if p
-            else ""
-        )
+        searched = number_of(len(entry["candidates"]), "candidate")
+        text += f" ({p}, corrected for the search of {searched})" if p else ""
         yield f"{text}."
 
 
@@ -223,7 +220,7 @@ def _rivals(summary: Mapping[str, Any]) -> Iterator[str]:
         if apart:
             second = max(apart, key=lambda c: c["gain"])
             how = "estimated in its place" if second.get("estimated") else "by its score"
-            of = "the others" if alike else f"the {len(apart)} others instead of {own}"
+            of = "the others" if alike else f"the {number_of(len(apart), 'other')} instead of {own}"
             which = called(name(second), titles)
             yield f"Of {of} {which} comes nearest: {how} it explains {_share(second)}."
 
@@ -302,7 +299,8 @@ def _untried(summary: Mapping[str, Any]) -> str:
     if not failed:
         return ""
     texts = [f"{count} ({reason})" for reason, count in Counter(failed.values()).most_common()]
-    return f"{len(failed)} candidates have no score: {', '.join(texts)}."
+    have = "has" if len(failed) == 1 else "have"
+    return f"{number_of(len(failed), 'candidate')} {have} no score: {', '.join(texts)}."
 
 
 def write_report(

@@ -23,8 +23,9 @@ from bayesoleo._report.tables import (
     words,
 )
 from bayesoleo.data import _frequency_response as response
+from bayesoleo.discovery._inference import MORE, NO_MORE
 from bayesoleo.discovery._policy import SearchPolicy
-from bayesoleo.discovery._work import ENDED
+from bayesoleo.discovery._work import ENDS
 from bayesoleo.effects._catalogue import (
     PROPER,
     called,
@@ -34,8 +35,12 @@ from bayesoleo.effects._catalogue import (
     with_titles,
 )
 from bayesoleo.effects._nonparametric import FAMILY
+from bayesoleo.errors import number_of
 from bayesoleo.plots._discovery import chosen, format_p, format_probability, format_share, name
 from bayesoleo.plots._style import Scale, format_value
+
+#: Said of errors that two judgements put on either side of what chance allows.
+_AT_THE_LIMIT = "the error in the fitted runs is at the limit of what chance allows"
 
 
 def role_shown(summary: Mapping[str, Any]) -> str:
@@ -81,15 +86,16 @@ def headline_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
     rest = text[first:].lstrip(",;. ")
     subject = "It explains" if len(summary["effects"]) == 1 else "They explain"
     # A title of its own leaves its participle without a sentence.
-    return f"{text[:first]}.", begin(re.sub("^explaining", subject, rest))
+    rest = re.sub("^explaining", subject, rest)
+    return f"{text[:first]}.", begin(re.sub("^(and|but) ", "", rest))
 
 
 def _ended_early(summary: Mapping[str, Any]) -> str:
     """A sentence on a quick search that went no further; empty of any other."""
     last = summary["rounds"][-1] if summary["rounds"] else {}
-    if last.get("reason") != ENDED:
+    if not str(last.get("reason", "")).startswith(ENDS):
         return ""
-    return " The quick search ended there: without --quick it goes on."
+    return " The quick search ended there: without --quick (in Python quick=False) it goes on."
 
 
 def _not_tried(summary: Mapping[str, Any]) -> str:
@@ -97,7 +103,7 @@ def _not_tried(summary: Mapping[str, Any]) -> str:
     left_out = summary.get("effects_left_out", 0)
     if not left_out or not summary["effects"]:
         return ""
-    return f" The search was not given {left_out} other effects of the catalogue."
+    return f" The search was not given {number_of(left_out, 'other effect')} of the catalogue."
 
 
 def _said(summary: Mapping[str, Any]) -> str:
@@ -110,6 +116,8 @@ def _said(summary: Mapping[str, Any]) -> str:
     likely = structures.with_probability(summary)
     outside = structures.outside_acts(summary, structures.of_set(summary))
     down = f"the error is then down to {words(summary)}"
+    if any(map(too_large, _errors_of(summary))):
+        down = f"but {_size_left(summary)}"
     if sure == schema.CERTAIN:
         return f"Certain: {found} {was} missing{likely}; {down}.{structures.next_best(summary)}"
     if sure == schema.PROBABLE:
@@ -139,7 +147,9 @@ def named_in_part(summary: Mapping[str, Any]) -> bool:
 def _nothing_added(summary: Mapping[str, Any]) -> str:
     """The result where no effect was added."""
     found = structures.known(summary)
-    if summary["verdict"] == schema.NOTHING_MISSING:
+    if summary["verdict"] == schema.NOTHING_MISSING and not any(
+        map(too_large, _errors_of(summary))
+    ):
         explains = f"the model explains the measurements down to {words(summary)}"
         if found is None:
             return f"Nothing is missing: {explains}."
@@ -385,7 +395,7 @@ def runs_used(summary: Mapping[str, Any]) -> str:
 
 
 def _runs(labels: list[str]) -> str:
-    number = f"{len(labels)} run{'s' if len(labels) > 1 else ''}"
+    number = number_of(len(labels), "run")
     return f"{number} ({', '.join(labels)})" if len(labels) <= MOST_LABELS else number
 
 
@@ -399,11 +409,40 @@ def error_model(attributes: Mapping[Any, Any], summary: Mapping[str, Any]) -> st
     summary : mapping
         As in ``summary.json``; its titles are used.
     """
-    why = str(attributes.get(schema.ERROR_MODEL_REASON, ""))
+    why = _agreeing(str(attributes.get(schema.ERROR_MODEL_REASON, "")), summary)
     if why:
         return f"{begin(with_titles(why, catalogue_titles() | titles(summary)))}."
     word = str(attributes.get("error_model", ""))
     return f"The intervals assume {word} errors." if word else ""
+
+
+def _agreeing(why: str, summary: Mapping[str, Any]) -> str:
+    """The reason for an error model, where the errors of the search are judged alike.
+
+    They are judged together with the hold-out runs, so that one at the limit of chance may be
+    within it for one of the two and beyond it for the other.
+    """
+    large = any(map(too_large, _errors_of(summary, schema.FIT)))
+    if NO_MORE in why:
+        return why.replace(NO_MORE, _AT_THE_LIMIT) if large else why
+    return why if large else why.replace(MORE, _AT_THE_LIMIT)
+
+
+def _errors_of(summary: Mapping[str, Any], role: str | None = None) -> list[Mapping[str, Any]]:
+    """Errors of the final model, of each output over all runs of a role and in each run."""
+    pooled = [
+        errors
+        for one, outputs in summary["error_after"].items()
+        for errors in outputs.values()
+        if role in (None, one)
+    ]
+    single = [
+        errors
+        for runs in summary["rounds"][-1].get("error", {}).values()
+        for errors in runs.values()
+        if role in (None, errors.get("role", role))
+    ]
+    return [*pooled, *single]
 
 
 def reason(entry: Mapping[str, Any], known: Mapping[str, str] | None = None) -> str:
@@ -442,7 +481,11 @@ def stability(summary: Mapping[str, Any]) -> str:
         if len(known) > 1
         else "The periodic solution is stable"
     )
-    went = f" Solutions changed branch or stability {jumps} times on the way." if jumps else ""
+    went = (
+        f" Solutions changed branch or stability {number_of(jumps, 'time')} on the way."
+        if jumps
+        else ""
+    )
     return f"{text}; {end}.{went}"
 
 
@@ -484,7 +527,7 @@ def _above_floor(output: str, runs: Mapping[str, Any], than: str) -> str:
         return f"The noise of {output} is not known in any run: only the rms of the residual is."
     worst = max(known, key=lambda run: known[run])
     above = sum(too_large(runs[run]) for run in known)
-    lead = "No run" if above == 0 else f"{above} of {len(known)} runs"
+    lead = "No run" if above == 0 else f"{above} of {number_of(len(known), 'run')}"
     verb = "has" if above <= 1 else "have"
     largest = f"the largest is {format_ratio(known[worst])} times {than}, in {worst}"
     return f"{lead} {verb} an error of {output} beyond what chance allows; {largest}."
@@ -573,7 +616,8 @@ def response_sentence(entry: Mapping[str, Any]) -> str:
     """
     size = format_value(entry["input_rms"], entry["drive_unit"])
     low, high = (f"{one:.3g}" for one in entry["band"])
-    many = f"{entry['realisations']} realisation" + "s" * (entry["realisations"] > 1)
+    many = number_of(entry["realisations"], "realisation")
+    lines = number_of(entry["lines"], "excited line")
     shown = [
         f"{kind} distortion {_times_noise(sizes)}" for kind, sizes in entry["distortion"].items()
     ]
@@ -585,8 +629,8 @@ def response_sentence(entry: Mapping[str, Any]) -> str:
     if share is not None and share >= _INPUT_SHARE:
         shown.append(f"the input has {100 * share:.2g} % of its amplitude at unexcited lines too")
     return (
-        f"from {entry['drive']} to {entry['output']} at {size} rms ({many}, {entry['lines']} "
-        f"excited lines from {low} to {high} Hz): {'; '.join(shown)}"
+        f"from {entry['drive']} to {entry['output']} at {size} rms ({many}, "
+        f"{lines} from {low} to {high} Hz): {'; '.join(shown)}"
     )
 
 

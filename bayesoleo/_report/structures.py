@@ -555,6 +555,8 @@ def _answer(entry: Mapping[str, Any]) -> list[str]:
         text = f"{repeat['run']}, made once more, {gain} {repeat['information']:.2f} bits, more"
         text += f" than any new run: one {run_text(best, _scale(entry))} {gain}"
         text += f" {best['information']:.2f}"
+    elif repeat and best["information"] - repeat["information"] < 0.01:
+        text += f"; {repeat['run']}, made once more, as much"
     elif repeat:
         text += f"; no present run, made once more, more than {repeat['information']:.2f}"
     lines = [f"{text}."]

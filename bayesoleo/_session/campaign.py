@@ -34,7 +34,7 @@ from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._loop import ClosedLoop
 from bayesoleo.discovery._open_questions import Question
 from bayesoleo.discovery._result_tree import fitted_groups, point_group, records_tree
-from bayesoleo.errors import InputError, choose
+from bayesoleo.errors import InputError, choose, number_of
 from bayesoleo.estimation._problem import EstimationProblem
 from bayesoleo.model._model import Model
 from bayesoleo.plots._style import format_unit, format_value
@@ -195,7 +195,9 @@ class Campaign(data.CampaignData):
             row += [format_value(v, units[n]) for n, v in zip(names, values, strict=True)]
             rows.append(row)
         control = f", {self.controlled} controlled" if self.controlled else ""
-        return f"campaign {self.name}: {len(rows)} runs{control}\n{columns(head, rows)}"
+        return (
+            f"campaign {self.name}: {number_of(len(rows), 'run')}{control}\n{columns(head, rows)}"
+        )
 
     def _repr_html_(self) -> str:
         return html(repr(self), self.plot)

@@ -23,7 +23,7 @@ from bayesoleo._workflow.estimating import draw_from
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.discovery._inference import effective_at, function_errors
 from bayesoleo.error_models._correlated import PowerErrors
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, number_of
 from bayesoleo.estimation._estimate import estimate, polish
 from bayesoleo.estimation._function_problem import FunctionProblem
 from bayesoleo.estimation._point_estimate import PointEstimate, to_dataset
@@ -201,7 +201,8 @@ def check_call(call: Call, inputs: Mapping[str, Array], problem: FunctionProblem
     for name, column in inputs.items():
         if column.size != size and ("column", name) in call.arguments:
             raise InputError(
-                f"has {column.size} rows, the measured column has {size}", key=f"data[{name!r}]",
+                f"has {number_of(column.size, 'row')}, the measured column has {size}",
+                key=f"data[{name!r}]",
                 hint="give columns of one length",
             )  # fmt: skip
     try:
@@ -389,7 +390,7 @@ class FunctionWork:
         number = self.table[self.output].size
         terms = "".join(f" + {name}" for name in self.added)
         lines = [f"{self.output} = {self.name}({', '.join(self.inputs)}, …){terms}"]
-        lines.append(f"{number} samples of {', '.join(self.table)}")
+        lines.append(f"{number_of(number, 'sample')} of {', '.join(self.table)}")
         rows = []
         for name in unknowns_of(self.parameters):
             item = self.parameters[name]
@@ -415,7 +416,7 @@ class FunctionWork:
     def fit(self, method: str, callback: Say) -> tuple[FunctionFit, xr.DataTree]:
         """The estimate, and its tree."""
         problem = self.statement
-        callback(f"{method.upper()}, {len(problem.names)} unknowns")
+        callback(f"{method.upper()}, {number_of(len(problem.names), 'unknown')}")
         mbe = estimate(problem, method)
         fit = FunctionFit(problem, mbe, polish(problem, mbe))
         return fit, self.tree(fit, {})

@@ -41,7 +41,7 @@ from bayesoleo._storage.result_files import read_tree, write_tree
 from bayesoleo._workflow.predicting import predict
 from bayesoleo._workflow.task import reduce
 from bayesoleo.assessment._assess import assess
-from bayesoleo.errors import InputError, ResultsError, check_path
+from bayesoleo.errors import InputError, ResultsError, check_path, number_of
 from bayesoleo.estimation._baselines import baselines_in, table
 from bayesoleo.estimation._indifference_regions import indifference
 from bayesoleo.estimation._profile_likelihood import profile
@@ -442,7 +442,8 @@ class Posterior(Stored):
 
     def _text(self) -> str:
         posterior = self.tree[schema.POSTERIOR]
-        size = f"{posterior.sizes[schema.CHAIN]} chains of {posterior.sizes[schema.DRAW]} draws"
+        chains = number_of(posterior.sizes[schema.CHAIN], "chain")
+        size = f"{chains} of {number_of(posterior.sizes[schema.DRAW], 'draw')}"
         found = self.summary()
         warning = f"\nwarning: {found.data.attrs['warning']}" if found.data.attrs["warning"] else ""
         return f"posterior of {self.tree.attrs.get(schema.MODEL, '')}: {size}\n{found}{warning}"

@@ -27,7 +27,7 @@ from bayesoleo._types import Array
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.assessment._residual_tests import autocorrelation_time
 from bayesoleo.discovery._score_basis import coefficients, remains
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, number_of
 from bayesoleo.model._parameters import Parameter
 from bayesoleo.model._priors import Normal
 
@@ -127,7 +127,7 @@ def search_terms(
     left = terms
     tree = work.tree(fit, {})
     while left:
-        callback(f"round {len(rounds) + 1}: score {len(left)} terms")
+        callback(f"round {len(rounds) + 1}: score {number_of(len(left), 'term')}")
         scores = sorted(_scores(work, fit, left, len(terms)), key=lambda item: item.p_value)
         rounds.append(scores)
         best = scores[0] if scores else None

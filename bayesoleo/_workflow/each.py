@@ -56,6 +56,7 @@ from bayesoleo.errors import (
     InputError,
     ResultsError,
     UnfinishedError,
+    number_of,
 )
 from bayesoleo.model._model import Model
 
@@ -348,7 +349,11 @@ class Course:
             self.rest = time.monotonic() + (time.monotonic() - begin) / SAVING
 
     def _lost(self, left: int) -> UnfinishedError:
-        reason = f"the scheduler was lost; {left} tasks are left, and the same command does them"
+        are, them = ("is", "it") if left == 1 else ("are", "them")
+        reason = (
+            f"the scheduler was lost; {number_of(left, 'task')} {are} left, and the same command"
+            f" does {them}"
+        )
         return UnfinishedError([{"stage": "each", "reason": reason}], None, self.book.folder)
 
     def _fill(self, waiting: deque[Wanted], fetchers: ThreadPoolExecutor) -> None:
@@ -429,7 +434,7 @@ class Course:
         """Try a task again, unless that was done often enough."""
         one.task.attempts += loss.times
         if one.task.attempts > self.retries:
-            times = f"lost {one.task.attempts} times"
+            times = f"lost {number_of(one.task.attempts, 'time')}"
             self._finish(one, Outcome(f"{times}, the last time because {loss.reason}"))
             return
         if loss.times:

@@ -31,7 +31,7 @@ from bayesoleo.data._text_layout import (
     time_unit,
     unit_in_name,
 )
-from bayesoleo.errors import BayesoleoError, CampaignError
+from bayesoleo.errors import BayesoleoError, CampaignError, number_of
 
 MODEL, PICTURE = "model.py", "channels.png"
 TO_FILL_IN = "TO FILL IN"
@@ -259,7 +259,7 @@ def _timed(file: str, table: FileColumns) -> LookedAt:
     """Find the times of a file, or how it was sampled."""
     longest = max((values.size for values in table.columns.values()), default=0)
     if longest < _FEWEST:
-        raise CampaignError(f"has {longest} samples", file=file)
+        raise CampaignError(f"has {number_of(longest, 'sample')}", file=file)
     for name in sorted(table.columns, key=lambda n: not is_time(re.split(r"[/.]", n)[-1])):
         values = table.columns[name]
         unit = (table.units.get(name) or time_unit(name) or unit_in_name(name) or "").lower()
@@ -347,7 +347,8 @@ def _no_channel(column: str, looks: Sequence[LookedAt]) -> str:
     for look in looks:
         values = look.table.columns[column]
         if values.size != look.seconds.size:
-            return f"{values.size} samples in {look.file}, where most have {look.seconds.size}"
+            samples = number_of(values.size, "sample")
+            return f"{samples} in {look.file}, where most have {look.seconds.size}"
         finite = values[np.isfinite(values)]
         if finite.size < 0.5 * values.size:
             return f"it is more than half empty in {look.file}"

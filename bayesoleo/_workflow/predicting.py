@@ -35,7 +35,7 @@ from bayesoleo.discovery._fit_and_hold_out_error import compared
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._run_predictions import Prediction
 from bayesoleo.discovery._samples_that_count import weights
-from bayesoleo.errors import InputError, check_level
+from bayesoleo.errors import InputError, check_level, number_of
 from bayesoleo.estimation._baselines import (
     Baseline,
     added_text,
@@ -370,7 +370,8 @@ def _as_judged(tree: xr.DataTree, record: Record, run: _Run, model: Model) -> _R
 def _sd_of(output: str, known: Known, record: Record) -> Array:
     """Noise of an output; of one that was not fitted, what the record itself shows."""
     number = len(next(iter(known.sd.values())))
-    return known.sd.get(output, np.full(number, record.signal_noise.get(output, 0.0)))
+    shown = float(np.nan_to_num(record.signal_noise.get(output, 0.0)))
+    return known.sd.get(output, np.full(number, shown))
 
 
 def _dataset(model: Model, records: Sequence[Record], found: Sequence[_Run]) -> xr.Dataset:
@@ -459,7 +460,10 @@ def forecast_text(data: xr.Dataset) -> str:
                 f"{one['ratio_to_expected']:.2f}",
             ]
             rows.append([str(output), str(run), *cells])
-    lines = [columns(head, rows), f"{data.attrs['draws']} draws of {data.attrs['model']}"]
+    lines = [
+        columns(head, rows),
+        f"{number_of(data.attrs['draws'], 'draw')} of {data.attrs['model']}",
+    ]
     lines += [str(data.attrs[key]) for key in (ADDED, REMOVED) if data.attrs.get(key)]
     for run in data[schema.RUN].values:
         failed = json.loads(str(data["failed"].sel(run=run).values))

@@ -347,7 +347,7 @@ def same_noise(tree: xr.DataTree, record: Record, output: str) -> bool:
     there, here = _stored(tree, record, output), record.samples[output]
     if there is None:
         return False
-    noise = max(record.signal_noise.get(output, 0.0), 1e-6 * float(np.ptp(here)))
+    noise = np.fmax(record.signal_noise.get(output, 0.0), 1e-6 * float(np.ptp(here)))
     return bool(np.sqrt(np.mean(np.diff(there - here) ** 2)) < noise)
 
 

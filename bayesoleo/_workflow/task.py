@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 
 from bayesoleo import _schema as schema
-from bayesoleo._units import parse_unit, same_quantity
+from bayesoleo._units import angle_hint, parse_unit, same_quantity
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.data._campaign import CampaignData, load_campaign
 from bayesoleo.data._data_warnings import data_warnings, frequency_warnings
@@ -38,6 +38,7 @@ from bayesoleo.data._reduction import ReducedCampaign, reduce_campaign
 from bayesoleo.discovery._assembly import Assembly, Roles, assign
 from bayesoleo.discovery._compile_ahead import begin_compiling
 from bayesoleo.discovery._fit import ModelFit
+from bayesoleo.effects._catalogue import listed
 from bayesoleo.errors import CampaignError, DataWarning, InputError, ModelError
 from bayesoleo.estimation._nuisance import declared_nuisance
 from bayesoleo.model._derivatives import derive
@@ -373,7 +374,10 @@ def prepare(
     _check_units(driven, reduced.campaign)
     _check_held(driven, reduced)
     reduced = within_bands(reduced, driven)
-    for sentence in stepped_inputs(reduced, driven):
+    for sentence in (
+        *drive_not_followed(model, reduced.campaign, settings.drive),
+        *stepped_inputs(reduced, driven),
+    ):
         warnings.warn(sentence, DataWarning, stacklevel=2)
     return Task(reduced, assign(reduced.records), assembly, settings)
 
@@ -518,7 +522,8 @@ def _check_units(model: Model, campaign: CampaignData) -> None:
                 file=campaign.path / "campaign.toml",
                 key=f"channels.{name}.unit",
                 value=channel.unit,
-                hint=f"write a unit that converts to {unit}, or declare the model otherwise",
+                hint=angle_hint(channel.unit, wanted.name)
+                or f"write a unit that converts to {unit}, or declare the model otherwise",
             )
 
 
@@ -533,9 +538,9 @@ def _check_held(model: Model, reduced: ReducedCampaign) -> None:
             unit = model.dofs[dof].unit
             rate = f", in {unit}/s," if unit else ""
             instead = (
-                "leave it out"
-                if model.order(dof) == 1
-                else f"declare its rate{rate} as the dof, of first order"
+                f"declare its rate{rate} as the dof, of first order"
+                if model.order(dof) > 1
+                else f"leave {dof!r} out and solve its equation for dot({dof}), to write that there"
             )
             raise ModelError(
                 f"model {model.name!r}: nothing holds {dof!r}. Only its derivatives are in"
@@ -543,8 +548,8 @@ def _check_held(model: Model, reduced: ReducedCampaign) -> None:
                 f" {periodic[0]}",
                 key="dofs",
                 value=dof,
-                hint=f"{instead}; or declare all runs as transients (kind = 'transient') that begin"
-                f" at Dof({unit!r}, initial='0')",
+                hint="declare all runs as transients (kind = 'transient') that begin at"
+                f" Dof({unit!r}, initial='0'); or {instead}",
             )
 
 
@@ -559,6 +564,37 @@ def choose_drive(model: Model, campaign: CampaignData, wanted: str | None) -> st
     if controlled is None or controlled in model.inputs or controlled not in possible_drives(model):
         return None
     return controlled
+
+
+def drive_not_followed(model: Model, campaign: CampaignData, wanted: str | None) -> list[str]:
+    """A sentence on a controlled channel that cannot drive a model; none where nothing is amiss.
+
+    It is no error: a campaign is there for several models.
+
+    Parameters
+    ----------
+    model : Model
+        In its own drive.
+    campaign : CampaignData
+    wanted : str or None
+        The setting ``drive``, which leaves nothing to say.
+    """
+    controlled, possible = campaign.controlled, possible_drives(model)
+    if wanted is not None or controlled is None or controlled in possible:
+        return []
+    why = (
+        f"which is an output of model {model.name!r} that no input can be exchanged for"
+        if controlled in model.outputs
+        else f"which is neither an input nor an output of model {model.name!r}"
+    )
+    own = listed(list(model.inputs)) or "no input at all"
+    measured = [name for name in possible if name in campaign.channels]
+    instead = f"one of: {', '.join(measured)}" if measured else "none of the channels"
+    return [
+        f"campaign.toml says controlled = {controlled!r}, {why}: the model is driven by {own}."
+        f" It can be driven by {instead}. If its own inputs are meant, say so by --drive model or,"
+        " in Python, drive='model'"
+    ]
 
 
 def check(campaign: Source, model: Model, settings: Settings = Settings()) -> dict[str, Any]:

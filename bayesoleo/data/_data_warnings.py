@@ -321,9 +321,10 @@ def _about_removed(records: Sequence[Record], units: Mapping[str, str]) -> list[
         if tones:
             loudest, where = max(tones, key=lambda pair: pair[0].amplitude)
             runs = list(dict.fromkeys(label for _, label in tones))
+            which = "" if len(tones) == 1 else f"the loudest in run {where} "
             found.append(
-                f"{channel} has a tone that is no harmonic of the drive ({_runs(runs)}), the "
-                f"loudest in run {where} at {loudest.frequency:.4g} Hz with the amplitude "
+                f"{channel} has a tone that is no harmonic of the drive ({_runs(runs)}), {which}"
+                f"at {loudest.frequency:.4g} Hz with the amplitude "
                 f"{loudest.amplitude:.3g}{unit}: it was removed; to keep it leave tone out of "
                 "disturbances"
             )
@@ -375,7 +376,8 @@ def _about_channels(record: Record, units: Mapping[str, str]) -> list[str]:
     found = [
         f"{where}{line.channel} has a line at {line.frequency:.4g} Hz with the amplitude "
         f"{line.amplitude:.3g}{_unit(units, line.channel)}, which is no harmonic of "
-        f"{record.frequency:.4g} Hz: a periodic source besides the drive; it counts as noise"
+        f"{record.frequency:.4g} Hz: a periodic source besides the drive, or a free "
+        "oscillation that has not died away; it counts as noise"
         for line in foreign_lines(record)
     ]
     found += [

@@ -37,12 +37,23 @@ from numpy.typing import NDArray
 
 from bayesoleo._types import Array, Complex, ComplexArray, Float
 from bayesoleo.data._fourier import HarmonicBasis
+from bayesoleo.data._sample_quality import step_of
 from bayesoleo.errors import InputError
 
 #: Highest order of differences tried; beyond it white noise would be all that is left of any
 #: sensible sampling.
 HIGHEST_DIFFERENCE = 8
 
+#: A jump exceeds the usual change between samples this many times: normal noise exceeds its
+#: standard deviation so far once in a thousand million samples.
+JUMP = 6.0
+#: It exceeds the two changes on either side this many times, a steep part of a sinusoid 8.5 times
+#: at most, and takes so many intervals at most: a filter before the converter spreads it.
+QUIET, LONGEST_JUMP = 10.0, 3
+#: Lower quartile of the absolute value of a normal variate.
+_LOWER_QUARTILE = 0.3186
+#: Levels are this part of the whole range apart, and each holds this part of the samples.
+LEVELS_APART, FEWEST_AT_LEVEL = 0.05, 0.01
 #: Averages of a run, and samples in one at least.
 MOST_AVERAGES, FEWEST_SAMPLES = 200, 4
 #: Lines that are averaged lie within this many periods' worth of lines, or this part of the
@@ -72,12 +83,45 @@ def innovation_noise(values: Array, kept: NDArray[np.bool_] | None = None) -> fl
     float
         In the signal's unit.
     """
+    found = _from_differences(values, kept, None)
+    if found is None:
+        found = _from_differences(values, None, None)
+    return np.inf if found is None else found
+
+
+def noise_beside_jumps(values: Array) -> float:
+    """The same of a signal with jumps: differences across these do not count, see :func:`jumps`.
+
+    The search for missing effects does without: where a prediction jumps too, an error of when it
+    does would stand beside a noise that knows of no jump.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        Signal at equidistant times.
+
+    Returns
+    -------
+    float
+        In the signal's unit.
+    """
+    found = _from_differences(values, None, jumps(values))
+    return innovation_noise(values) if found is None else found
+
+
+def _from_differences(
+    values: Array, kept: NDArray[np.bool_] | None, jumped: NDArray[np.bool_] | None
+) -> float | None:
+    """Noise by the differences that hold no jump and only samples that count; None if too few."""
     whole = np.ones(values.size, dtype=bool) if kept is None else kept
+    across = np.zeros(values.size - 1, dtype=bool) if jumped is None else jumped
+    some = kept is not None or bool(across.any())
     difference, estimate, latest = np.diff(values, 2), np.inf, np.inf
-    valid = whole[2:] & whole[1:-1] & whole[:-2]
+    joined = whole[1:] & whole[:-1] & ~across
+    valid = joined[1:] & joined[:-1]
     for order in range(2, HIGHEST_DIFFERENCE + 1):
-        used = difference if kept is None else difference[valid]
-        if kept is not None and used.size < 8:
+        used = difference[valid] if some else difference
+        if some and used.size < 8:
             break
         latest = float(np.sqrt(np.mean(used**2) / comb(2 * order, order)))
         # Two per cent is within the scatter of the estimate for a few thousand samples.
@@ -86,7 +130,93 @@ def innovation_noise(values: Array, kept: NDArray[np.bool_] | None = None) -> fl
         estimate = latest
         difference, valid = np.diff(difference), valid[1:] & valid[:-1]
     found = min(estimate, latest)
-    return found if np.isfinite(found) or kept is None else innovation_noise(values)
+    return found if np.isfinite(found) or not some else None
+
+
+def jumps(values: Array) -> NDArray[np.bool_]:
+    """Intervals between samples across which a signal jumps to another level, shape (N - 1,).
+
+    A jump takes up to :data:`LONGEST_JUMP` intervals in one direction, and the signal is quiet
+    right before and after it. So neither an outlier is one, which returns at once, nor a pulse, nor
+    a burst of noise, nor the fast part of a sweep: they have large changes side by side. Where most
+    large changes stand alone like that, the others are jumps in quick succession. Steps of a
+    converter's digits are none. A jump of the slope counts too, at the interval after it: what
+    follows an input that is switched has one.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        Signal at equidistant times.
+    """
+    digit = step_of(values)
+    found = _jumps(values, digit)
+    found[1:] |= _jumps(np.diff(values), digit)
+    return found
+
+
+def _jumps(values: Array, digit: float) -> NDArray[np.bool_]:
+    """Intervals of jumps that exceed so many digits of a converter."""
+    size = np.abs(np.diff(values))
+    none = np.zeros(size.size, dtype=bool)
+    if size.size < 2 * HIGHEST_DIFFERENCE:
+        return none
+    usual = _usual(size)
+    if not size.max() * LONGEST_JUMP > JUMP * usual:  # nor where they are not finite
+        return none
+    least = JUMP * max(usual, digit)
+    # Noise that neighbours of a jump may show: of the fourth differences, which see no slope.
+    slack = 3.0 * _usual(np.abs(np.diff(values, 4))) * np.sqrt(2.0 / comb(8, 4))
+    alone = np.logical_or.reduce(
+        [_alone(values, size, width, least, slack) for width in range(1, LONGEST_JUMP + 1)]
+    )
+    tall = size[alone & (size > least)]
+    if tall.size:
+        # What moves fast after a jump, such as a current that decays, is no jump.
+        least = max(least, 0.5 * float(np.quantile(tall, 0.25)))
+    large = alone | (size > least)
+    return large if np.count_nonzero(alone) >= 0.5 * np.count_nonzero(large) else none
+
+
+def _usual(size: Array) -> float:
+    """Standard deviation of normal numbers of these sizes, the larger ones whatever they are."""
+    return float(np.quantile(size, 0.25)) / _LOWER_QUARTILE
+
+
+def _alone(values: Array, size: Array, width: int, least: float, slack: float) -> NDArray[np.bool_]:
+    """Intervals of jumps that take so many intervals and have quiet ones on both sides."""
+    whole = np.abs(values[width:] - values[:-width])
+    # All changes within go one way where their sizes add up to the whole.
+    steady = np.convolve(size, np.ones(width), mode="valid") <= whole * (1.0 + 1e-9)
+    # Before the first and after the last sample nothing is known: no jump is found there.
+    padded = np.concatenate([[np.inf, np.inf], size, [np.inf, np.inf]])
+    sides = [padded[k : k + whole.size] for k in (0, 1, width + 2, width + 3)]
+    quiet = np.max(sides, axis=0) < np.maximum(whole / QUIET, slack)
+    jump = (steady & quiet & (whole > width * least)).astype(float)
+    return np.asarray(np.convolve(jump, np.ones(width)) > 0.5)
+
+
+def scatter_about_levels(values: Array) -> float:
+    """Standard deviation about few levels that a signal has; infinite where there are none.
+
+    It bounds the noise of a signal that is switched, even one that is switched at every sample.
+    Levels without any scatter may be those of a coarse converter, and say nothing.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+    """
+    ordered = np.sort(values)
+    gaps, span = np.diff(ordered), float(ordered[-1] - ordered[0])
+    apart = gaps > LEVELS_APART * span
+    level = np.concatenate([[0], np.cumsum(apart)])
+    counts = np.bincount(level)
+    if counts.size < 2 or counts.min() < max(8, FEWEST_AT_LEVEL * values.size):
+        return np.inf
+    mean = np.bincount(level, ordered) / counts
+    free = values.size - counts.size
+    scatter = float(np.sqrt(np.sum((ordered - mean[level]) ** 2) / free))
+    known = 1e-6 * span < scatter < gaps[apart].min() / JUMP
+    return scatter if known else np.inf
 
 
 @dataclass(frozen=True)

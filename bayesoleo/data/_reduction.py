@@ -9,7 +9,7 @@ adds no error to a signal without higher harmonics.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -20,7 +20,13 @@ from bayesoleo.data._campaign import CampaignData
 from bayesoleo.data._fourier import HarmonicBasis
 from bayesoleo.data._harmonics import significant_harmonics, within_bandwidth
 from bayesoleo.data._held_inputs import between_samples, held_harmonics
-from bayesoleo.data._noise import average_on, innovation_noise, periodic_average
+from bayesoleo.data._noise import (
+    average_on,
+    jumps,
+    noise_beside_jumps,
+    periodic_average,
+    scatter_about_levels,
+)
 from bayesoleo.data._residual_time_shift import Frequency, find_frequency
 from bayesoleo.data._run_samples import Run
 from bayesoleo.data._sample_quality import (
@@ -32,10 +38,13 @@ from bayesoleo.data._sample_quality import (
     whole_periods,
 )
 from bayesoleo.errors import CampaignError, InputError, choose
-from bayesoleo.prediction._band_limited import band_limited_channels, sample_noise
+from bayesoleo.prediction._band_limited import Smoothed, band_limited_channels, sample_noise
 from bayesoleo.prediction._records import Harmonics, Record
 
 Method = Literal["band-limited", "linear"]
+
+#: Differences between samples of a command tell its noise up to this part of its deviation.
+MOST_NOISE = 0.3
 
 
 def on_grid(
@@ -284,6 +293,19 @@ def _record(run: Run, time: Array, samples: Mapping[str, Array], **reduced: Any)
 def _transient(run: Run) -> Record:
     step, away = run.time_step, masked(run.time, run.mask)
     whole = bridged(np.array(list(run.samples.values())), away)
+    noise = {
+        name: _transient_noise(x[~away], sample_noise(values, step), name in run.held)
+        for (name, x), values in zip(run.samples.items(), whole, strict=True)
+    }
+    curves = band_limited_channels(
+        {
+            name: between_samples(values) if name in run.held else np.array(values)
+            for name, values in zip(run.samples, whole, strict=True)
+        },
+        step,
+        {name: step_of(x[~away]) for name, x in run.samples.items()},
+        run.bandwidths,
+    )
     return _record(
         run,
         run.time,
@@ -292,18 +314,38 @@ def _transient(run: Run) -> Record:
         frequency_sd=float("nan"),
         periods=0,
         harmonics={},
-        signal_noise={
-            name: min(innovation_noise(x[~away]), sample_noise(values, step))
-            for (name, x), values in zip(run.samples.items(), whole, strict=True)
+        signal_noise=noise,
+        smoothed={
+            name: _with_noise(curve, run.samples[name][~away], noise[name])
+            for name, curve in curves.items()
         },
-        smoothed=band_limited_channels(
-            {
-                name: between_samples(values) if name in run.held else np.array(values)
-                for name, values in zip(run.samples, whole, strict=True)
-            },
-            step,
-            {name: step_of(x[~away]) for name, x in run.samples.items()},
-            run.bandwidths,
-        ),
         kept=~away if away.any() else None,
     )
+
+
+def _with_noise(curve: Smoothed, values: Array, noise: float) -> Smoothed:
+    """A curve that jumps, with its noise: its spectrum has no floor that would tell it."""
+    if not (curve.noise == 0.0 and noise > 0.0 and jumps(values).any()):
+        return curve
+    derivatives = tuple(
+        replace(one, noise=noise) if one.noise == 0.0 else one for one in curve.derivatives
+    )
+    return replace(curve, noise=noise, derivatives=derivatives)
+
+
+def _transient_noise(values: Array, floor: float, held: bool) -> float:
+    """Standard deviation of a transient's sample; not a number where nothing tells it.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N,)
+        Samples that count.
+    floor : float
+        By the lowest part of the spectrum.
+    held : bool
+        Whether a controller holds the channel from one sample to the next: what changes at every
+        sample is then its command, and differences say nothing of noise.
+    """
+    found = min(noise_beside_jumps(values), floor, scatter_about_levels(values))
+    smooth = found <= MOST_NOISE * float(np.std(values))
+    return found if smooth or not held or jumps(values).any() else float("nan")

@@ -19,7 +19,7 @@ from bayesoleo._units import SECOND_MEANINGS, parse_unit
 from bayesoleo.data._campaign_toml import FILE, Channel, RunDeclaration
 from bayesoleo.data._sample_quality import Stretches, bridged, impossible_sample, masked
 from bayesoleo.data._text_layout import TIME_UNITS, FileColumns, is_time, time_unit, unit_in_name
-from bayesoleo.errors import CampaignError, DataWarning, choose
+from bayesoleo.errors import CampaignError, DataWarning, choose, number_of
 
 #: Part of the spacings that must deviate, and the largest spacing over the median, for a record to
 #: be resampled. Larger gaps hold no information, and a spline would invent it.
@@ -164,7 +164,7 @@ def _rows_of(
         first, last = declared.rows[0] - 1, min(declared.rows[1], last)
         if declared.rows[1] > time.size:
             raise CampaignError(
-                f"the file has {time.size} rows", key="rows", value=list(declared.rows)
+                f"the file has {number_of(time.size, 'row')}", key="rows", value=list(declared.rows)
             )
     elif isinstance(declared.segment, tuple):
         first, last = _rows_with(table, *declared.segment)
@@ -172,8 +172,8 @@ def _rows_of(
         starts = [0, *(np.flatnonzero(np.diff(time[:last]) < 0) + 1), last]
         if declared.segment >= len(starts):
             raise CampaignError(
-                f"time starts anew {len(starts) - 2} times in this file, which makes "
-                f"{len(starts) - 1} segment(s)",
+                f"time starts anew {number_of(len(starts) - 2, 'time')} in this file, which makes "
+                f"{number_of(len(starts) - 1, 'segment')}",
                 key="segment",
                 value=declared.segment,
                 hint="write the number of one of them, or rows = [first, last]",
@@ -367,7 +367,9 @@ def _samples(
     values = _column(table, column)
     written, time, size = times
     if values.size != size:
-        raise CampaignError(f"column has {values.size} samples and time {size}", column=column)
+        raise CampaignError(
+            f"column has {number_of(values.size, 'sample')} and time {size}", column=column
+        )
     values = values[part]
     _check_finite(values, written, column, part.start, away)
     if not np.array_equal(written, time) and is_uneven(written):
@@ -376,7 +378,7 @@ def _samples(
     missing = np.flatnonzero(gap & ~away)
     if missing.size:
         raise CampaignError(
-            f"{missing.size} missing value(s), the first at {time[missing[0]]:.6g} s",
+            f"{number_of(missing.size, 'missing value')}, the first at {time[missing[0]]:.6g} s",
             column=column,
             value=float(values[missing[0]]),
             hint="cut the run there with start or stop, mask the gap, or fill it",
@@ -411,7 +413,7 @@ def _check_finite(
     if found.size:
         row = int(found[0])
         raise CampaignError(
-            f"{found.size} infinite value(s), the first in row {before + row + 1}, at "
+            f"{number_of(found.size, 'infinite value')}, the first in row {before + row + 1}, at "
             f"{time[row]:.6g} s",
             column=column,
             value=float(values[row]),
@@ -529,7 +531,7 @@ def _check_gaps(time: Array, spacing: Array, resolution: float, column: str) -> 
     if spacing[row] > 1.49 * usual:
         missing = max(1, round(spacing[row] / usual) - 1)
         raise CampaignError(
-            f"gap of {missing} missing sample(s) after {time[row]:.6g} s",
+            f"gap of {number_of(missing, 'missing sample')} after {time[row]:.6g} s",
             column=column,
             hint="cut the run there with start or stop",
         )

@@ -29,7 +29,7 @@ from bayesoleo.data._text_layout import (
     split_cells,
     without_remark,
 )
-from bayesoleo.errors import CampaignError
+from bayesoleo.errors import CampaignError, number_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -220,7 +220,7 @@ def _ragged(path: Path, layout: TextLayout) -> CampaignError:
         if len(cells) > width:
             mark = {WHITESPACE: " "}.get(layout.delimiter, layout.delimiter)
             return CampaignError(
-                f"line {number} has {len(cells)} cells, the header {width}",
+                f"line {number} has {number_of(len(cells), 'cell')}, the header {width}",
                 file=path.name,
                 value=mark.join(cells)[:60],
                 hint="correct that line, or set the delimiter of this run",

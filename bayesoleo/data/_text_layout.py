@@ -24,7 +24,7 @@ import numpy as np
 
 from bayesoleo._types import Array
 from bayesoleo._units import parse_unit
-from bayesoleo.errors import CampaignError
+from bayesoleo.errors import CampaignError, number_of
 
 if TYPE_CHECKING:
     pass
@@ -485,8 +485,8 @@ def _numbered(path: Path, block: _Block, header: _Header) -> tuple[str, ...]:
     """Columns of a file without names are numbered from one."""
     if header.found:
         raise CampaignError(
-            f"header has {header.found} columns and the values {block.width}, split by "
-            f"{block.delimiter!r}",
+            f"header has {number_of(header.found, 'column')} and the values {block.width},"
+            f" split by {block.delimiter!r}",
             file=path.name,
             key="delimiter",
             value=header.line.strip()[:60],

@@ -19,7 +19,7 @@ from bayesoleo.effects._effect import Candidate, Effect
 from bayesoleo.effects._parts import Scales
 from bayesoleo.effects._places import PART
 from bayesoleo.effects._terms import FAMILY as TERMS, terms_of
-from bayesoleo.errors import CampaignError, ModelError
+from bayesoleo.errors import CampaignError, ModelError, number_of
 from bayesoleo.estimation._nuisance import Nuisance
 from bayesoleo.model._drive_and_start import driven_by, with_estimated_starts
 from bayesoleo.model._expressions import split_derivative
@@ -113,7 +113,9 @@ def assign(records: Sequence[Record]) -> Roles:
         )
     held_out = tuple(record for record in records if record.role != "fit")
     if held_out:
-        return Roles(fitted, held_out, "declared", f"{len(held_out)} declared hold-out runs")
+        return Roles(
+            fitted, held_out, "declared", f"{number_of(len(held_out), 'declared hold-out run')}"
+        )
     if len(fitted) >= 2:
         text = (
             "no hold-out run is declared: every run is predicted by a fit to the others"

@@ -23,6 +23,7 @@ from bayesoleo.discovery._mesh_error import (
 from bayesoleo.discovery._numerics import Numerics, problem_on
 from bayesoleo.discovery._other_starts import doubtful, from_other_starts, likeliest
 from bayesoleo.discovery._policy import SearchPolicy
+from bayesoleo.errors import number_of
 from bayesoleo.estimation._bayesian_estimators import method as step_of
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._estimate import estimate, polish
@@ -322,7 +323,8 @@ def _estimated(
     one mesh; parameters as of :func:`fit_model`."""
     several = start is not None and start.ndim == 2
     first = likeliest(problem, start) if start is not None and several else start
-    callback(f"{method.upper()}, {len(problem.names)} unknowns, {problem.predictor.steps} steps")
+    unknowns = number_of(len(problem.names), "unknown")
+    callback(f"{method.upper()}, {unknowns}, {problem.predictor.steps} steps")
     step = replace(step_of(method), damped=True) if damped else method
     most = limits if few is None else limits | {"max_iterations": few}
     mbe = estimate(problem, step, start=first, **most)  # type: ignore[arg-type]

@@ -165,13 +165,18 @@ def effective_at(problem: ResidualProblem, theta: Array) -> Array:
 MORE_THAN_NOISE = 1.5
 #: Fewest samples of which correlation is judged.
 _FEWEST = 20
-_PLAIN = "the noise is white, and no more than noise is left"
+#: What errors of the fitted runs are by their size, as parts of reasons. A search that judges more
+#: runs together may judge one at the limit of chance otherwise.
+MORE = "more than noise is left in the fitted runs"
+NO_MORE = f"no {MORE}"
+_PLAIN = f"the noise is white, and {NO_MORE}"
 _COLOURED = "the spectrum of the noise of {} is not flat (p = {:.1g})"
-_LEFT = "more than noise is left: log odds {:.0f} against noise alone"
-_BY_INPUTS = "noise of measured inputs reaches the outputs, and no more than noise is left"
+#: It says nothing of their size: small errors may be unlike noise.
+_LEFT = "effects of the catalogue explain the residual better than noise alone: log odds {:.0f}"
+_BY_INPUTS = f"noise of measured inputs reaches the outputs, and {NO_MORE}"
 _NOT_FLAT = "the spectrum of what is left of {} in transients is not flat (p {})"
 _NO_EFFECT = ", and no effect of the catalogue explains it better"
-_BEYOND = "more than noise is left, and no effect of the catalogue explains it"
+_BEYOND = f"{MORE}, and no effect of the catalogue explains it"
 _UNDECIDED = "effects that the data do not tell apart are left: {}"
 #: Probability of a residual by noise alone below which effects of the catalogue are looked for in
 #: it. Of 145 residuals of simulated campaigns that the catalogue explained better than noise, with

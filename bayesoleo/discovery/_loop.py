@@ -36,7 +36,7 @@ from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._state import State, better_start, fit_state, state_of
 from bayesoleo.discovery._structure_search import DEFAULT_PRIOR, structure_posterior
 from bayesoleo.discovery._structures import StructurePosterior, StructurePrior
-from bayesoleo.discovery._work import ENDED, work_of
+from bayesoleo.discovery._work import ENDED, ENDS, work_of
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._nonparametric import FAMILY
 
@@ -458,7 +458,7 @@ class SearchOptions:
 
 def _went_no_further(known: Progress) -> bool:
     """Whether a search was ended by the work that it had done."""
-    return known.finished and known.rounds[-1].reason == ENDED
+    return known.finished and str(known.rounds[-1].reason).startswith(ENDS)
 
 
 def searched(known: Progress, search: SearchOptions) -> Progress:

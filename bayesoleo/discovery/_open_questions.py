@@ -39,7 +39,7 @@ from bayesoleo.discovery._round import Round
 from bayesoleo.discovery._run_predictions import predict_fitted
 from bayesoleo.discovery._structure_search import structure_fits
 from bayesoleo.discovery._structures import StructurePosterior
-from bayesoleo.errors import InputError, ModelError
+from bayesoleo.errors import InputError, ModelError, number_of
 from bayesoleo.prediction._records import Record
 
 #: Reasons to distinguish effects.
@@ -285,7 +285,7 @@ def _of_structures(
         return ()
     names = tuple(structure_label(effects, chosen) for effects in chosen)
     number = len(loop.rounds)
-    plan.callback(f"look for a run that distinguishes {len(names)} structures")
+    plan.callback(f"look for a run that distinguishes {number_of(len(names), 'structure')}")
     try:
         first = loop.first
         scores = [item.score for item in loop.rounds[0].ranking]

@@ -38,6 +38,7 @@ from bayesoleo.discovery._score_tests import (
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._parts import Scales
 from bayesoleo.effects._places import BETWEEN
+from bayesoleo.errors import number_of
 from bayesoleo.model._model import Model, velocities_of
 from bayesoleo.model._velocity_dofs import is_velocity
 from bayesoleo.prediction._inputs import lacking
@@ -341,7 +342,7 @@ def score_candidates(
         if reason is not None
     }
     options = [one for one, reason in zip(options, reasons, strict=True) if reason is None]
-    callback(f"score {len(options)} candidates")
+    callback(f"score {number_of(len(options), 'candidate')}")
     if keep is not None and size_of(base.fit, options) <= MOST_KEPT:
         scores, failed, columns = score_and_keep(base, options, jobs)
         keep(Scanned(base.fit, assembly, effects, options, columns))

@@ -443,7 +443,9 @@ def _coordinate(loop: ClosedLoop) -> dict[str, tuple[list[Array], str, str]]:
     found = {schema.VELOCITY: (velocity, rate, f"velocity of {place.name}")}
     if place.position is None:
         return found
-    return {schema.STROKE: (position, unit, f"position of {names[0]}"), **found}
+    # A dof that is called position has no position of its own.
+    stroke = names[0] if names[0] == "position" else f"position of {names[0]}"
+    return {schema.STROKE: (position, unit, stroke), **found}
 
 
 def _motion_of(name: str, prediction: Prediction, drive: str | None) -> Array | None:

@@ -49,7 +49,7 @@ from bayesoleo.discovery._structure_comparison import (
 )
 from bayesoleo.discovery._structures import Structure, StructurePosterior, StructurePrior
 from bayesoleo.effects._nonparametric import Axis, balance_places
-from bayesoleo.errors import ModelError
+from bayesoleo.errors import ModelError, number_of
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Parameter
 from bayesoleo.model._priors import LogNormal
@@ -342,7 +342,7 @@ def structure_posterior(
             chosen += new[: max(AT_A_TIME - len(chosen), 0)]
         if not chosen:
             break
-        callback(f"estimate {len(chosen)} structures")
+        callback(f"estimate {number_of(len(chosen), 'structure')}")
         tried |= set(chosen)
         starts = [(effects, evidence.nearest(effects, declared)) for effects in chosen]
         found = process_map(extended, ground, starts, numerics.jobs, known=_records_of)

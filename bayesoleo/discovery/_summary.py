@@ -22,6 +22,7 @@ from bayesoleo.discovery._state import State
 from bayesoleo.discovery._structures import Structure, StructurePosterior, total_probability
 from bayesoleo.effects._catalogue import titles_for, with_titles
 from bayesoleo.effects._nonparametric import FAMILY
+from bayesoleo.errors import number_of
 from bayesoleo.estimation._baselines import common_baselines, notes_on
 from bayesoleo.posterior._diagnostics import Samples
 
@@ -397,8 +398,9 @@ def _input_noise_notes(state: State) -> list[str]:
             worst = max(entries, key=lambda e: e.input_noise / e.average.noise)
             times = worst.input_noise / worst.average.noise
             notes.append(
-                f"input noise dominates the noise of {output} in {len(entries)} runs: in run"
-                f" {worst.run} it is {times:.1f} times the output's own"
+                f"input noise dominates the noise of {output} in"
+                f" {number_of(len(entries), 'run')}: in run {worst.run} it is {times:.1f} times the"
+                " output's own"
             )
     return notes
 
@@ -409,9 +411,10 @@ def _sampler_notes(samples: Samples | None) -> list[str]:
     notes = [f"sampler: {samples.warning}"] if samples.warning else []
     if samples.jumped_part > MIXED:
         notes.append(
-            f"sampler: {samples.branch_jumps} solutions of runs left the branch of the estimate, in"
-            f" {samples.evaluations} evaluations, which may be {100 * samples.jumped_part:.2g} % of"
-            " the draws: the posterior may mix several answers of the model"
+            f"sampler: {number_of(samples.branch_jumps, 'solution')} of runs left the branch of"
+            f" the estimate, in {samples.evaluations} evaluations, which may be"
+            f" {100 * samples.jumped_part:.2g} % of the draws: the posterior may mix"
+            " several answers of the model"
         )
     return notes
 

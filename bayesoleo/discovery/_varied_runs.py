@@ -50,7 +50,7 @@ class Variation:
     like : str
         Label of the run that it varies.
     change : str
-        What is changed, in words; empty for a repetition.
+        What is changed, in words, as multiples of what the run has; empty for a repetition.
     start : float
         Factor of the estimated start of a transient.
     """
@@ -114,7 +114,7 @@ def moving_inputs(
 def _moves(records: Sequence[Record], name: str) -> bool:
     values = [record.samples[name] for record in records]
     size = max(float(np.abs(one).max()) for one in values)
-    noise = max(record.signal_noise.get(name, 0.0) for record in records)
+    noise = float(np.fmax.reduce([0.0, *(r.signal_noise.get(name, 0.0) for r in records)]))
     swing = max(float(np.std(one)) for one in values)
     return swing > max(CONSTANT * size, 2.0 * noise)
 
@@ -151,8 +151,10 @@ def _periodic(records: Sequence[Record], model: Model, outputs: Sequence[str]) -
                 for name, size in zip(inputs, sizes, strict=True)
             }
             turned = dict(zip(inputs, phases, strict=True))
-            words = [_times(name, factors[name]) for name in inputs]
-            words += [f"{name} {p:g} cycles ahead" for name, p in turned.items() if p]
+            words = [_times(f"amplitude of {name}", factors[name]) for name in inputs]
+            words += [
+                f"{name} {p:g} cycles ahead of where it was" for name, p in turned.items() if p
+            ]
             change = ", ".join(word for word in words if word)
             if change:
                 moved = {
@@ -165,7 +167,8 @@ def _periodic(records: Sequence[Record], model: Model, outputs: Sequence[str]) -
 
 
 def _times(name: str, factor: float) -> str:
-    return f"{name} × {factor:.3g}" if abs(factor - 1.0) > SAME else ""
+    """What is changed of the run that is varied; empty where it stays the same."""
+    return f"{factor:.3g} times its {name}" if abs(factor - 1.0) > SAME else ""
 
 
 def _swing(record: Record, name: str) -> float:
@@ -214,8 +217,11 @@ def _transient(records: Sequence[Record], model: Model, outputs: Sequence[str]) 
         begins = _targets(list(starts.values())) / starts[record.label] if starts else ()
         for factors, last, begin in product(product(*own), _and_one(lasts), _and_one(begins)):
             scale = dict(zip(inputs, map(float, factors), strict=True))
-            words = [_times(name, factor) for name, factor in scale.items()]
-            words += [_times("duration", last), _times("start", begin)]
+            words = [
+                _times(f"change of {name} since the first sample", factor)
+                for name, factor in scale.items()
+            ]
+            words += [_times("duration", last), _times("distance from rest at the start", begin)]
             change = ", ".join(word for word in words if word)
             if change:
                 blank = partial(

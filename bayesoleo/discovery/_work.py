@@ -15,9 +15,10 @@ from bayesoleo.discovery._round import Progress
 
 #: Work of a quick search.
 QUICK = 3e8
-#: Why a quick search goes no further.
+#: How the reason begins why a quick search goes no further; of results that are stored too.
+ENDS = "a quick search goes no further"
 ENDED = (
-    "a quick search goes no further; without --quick it looks for further effects, reviews those"
+    f"{ENDS}; without --quick (in Python quick=False) it looks for further effects, reviews those"
     " that were added, and says how probable they are"
 )
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from bayesoleo._types import Array, Integers
 from bayesoleo.error_models._base import RunSamples
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, number_of
 from bayesoleo.estimation._least_squares import BatchNormalEquations, reduce_rows
 from bayesoleo.estimation._problem import Evaluation, Misfit
 from bayesoleo.model._priors import Prior
@@ -72,7 +72,7 @@ class Broadcast:
                 "function must return one prediction for each sample of y",
                 key="x",
                 value=prediction.shape,
-                hint=f"y has {self._samples} samples: give x for as many",
+                hint=f"y has {number_of(self._samples, 'sample')}: give x for as many",
             )
         return np.broadcast_to(prediction, (self._samples,))
 
@@ -251,7 +251,7 @@ class FunctionProblem:
                 "data must be finite and as many as the problem's",
                 key="data",
                 value=np.shape(y),
-                hint=f"give {self._y.size} samples",
+                hint=f"give {number_of(self._y.size, 'sample')}",
             )
         other = copy(self)
         other._y = np.array(y)

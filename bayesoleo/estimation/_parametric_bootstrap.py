@@ -228,6 +228,10 @@ class CampaignSource:
         )
         if variance is not None:
             self.sd[:] = np.sqrt(_one_each(variance, problem.outputs))
+        if not np.isfinite(self.sd).all():
+            raise InputError(
+                "the noise of an output is unknown", key="variance", hint="give its variance"
+            )
 
     @property
     def records(self) -> Sequence[Record]:

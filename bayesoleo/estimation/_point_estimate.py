@@ -14,7 +14,7 @@ import xarray as xr
 from bayesoleo import _schema as schema
 from bayesoleo._schema import variable
 from bayesoleo._types import Array, Float, Int, Integers
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, number_of
 from bayesoleo.prediction._stability import Stability
 from bayesoleo.solvers._orbit import Status, added, counted
 
@@ -321,7 +321,7 @@ def as_text(point: PointEstimate) -> str:
     lines += [f"{n:<{width}}  {s:>12.6g}  {t:>12.6g}  {d:>9.2g}" for n, s, t, d in rows]
     for output, variance in zip(point.outputs, point.variance, strict=True):
         lines.append(f"{output}: residual standard deviation {np.sqrt(variance):.4g}")
-    steps = f"{point.iterations} iterations, {point.halvings} halvings"
+    steps = f"{number_of(point.iterations, 'iteration')}, {number_of(point.halvings, 'halving')}"
     lines.append(f"{point.method}: {point.status.message}; {steps}")
     if any(point.failures.values()):
         lines.append(f"trials that failed: {counted(point.failures)}")

@@ -15,6 +15,7 @@ from scipy import interpolate, stats
 
 from bayesoleo import _schema as schema
 from bayesoleo._schema import LabelledResult
+from bayesoleo.errors import number_of
 from bayesoleo.plots import _style as style
 from bayesoleo.plots._reading import dataset
 
@@ -202,7 +203,7 @@ def sampling_distribution(found: LabelledResult | xr.Dataset | xr.DataTree) -> F
             fontsize=style.SMALL, color=style.FAINT,
         )  # fmt: skip
     handles: list[Artist] = [
-        style.band(style.SIMILAR, f"{int(good.sum())} replications"),
+        style.band(style.SIMILAR, number_of(int(good.sum()), "replication")),
         style.line(style.AFTER, "Cramér-Rao bound"),
         style.line(style.BEFORE, "linearised estimator", 1.2, "--"),
     ]

@@ -15,7 +15,7 @@ from scipy import stats
 
 from bayesoleo import _schema as schema
 from bayesoleo._types import Array
-from bayesoleo.errors import ResultsError
+from bayesoleo.errors import ResultsError, number_of
 from bayesoleo.plots import _reading as reading, _style as style
 from bayesoleo.plots._discovery import chosen as accepted
 from bayesoleo.plots._estimates import REGION_MOST, closed_curve, panel_grid, panel_labels
@@ -429,7 +429,7 @@ def trace(tree: xr.DataTree, most: int = 7) -> Figure:
     middle = 0.12 / height
     figure.text(0.5, middle, "draw", ha="center", fontsize=style.TEXT, color=style.INK)
     count = np.unique(_ensembles(tree, rows[0][2].shape[0])).size
-    remark = f"{WALKERS} walkers of each of {count} ensemble{'s' if count > 1 else ''}"
+    remark = f"{WALKERS} walkers of each of {number_of(count, 'ensemble')}"
     style.legend(figure, [], remark)
     return figure
 

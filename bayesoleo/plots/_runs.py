@@ -24,7 +24,7 @@ from bayesoleo._types import Array, Integers
 from bayesoleo.data import _frequency_response as response
 from bayesoleo.data._campaign import CampaignData
 from bayesoleo.data._residual_time_shift import PeriodSearch
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, number_of
 from bayesoleo.estimation._between_runs import Hierarchy, between_runs
 from bayesoleo.plots import _reading as reading, _style as style
 from bayesoleo.plots._style import engineering
@@ -664,8 +664,7 @@ def _level_name(level: xr.Dataset) -> str:
     unit = str(level["input_rms"].attrs.get(schema.UNITS, ""))
     number, periods = int(level["realisations"]), int(level[schema.PERIODS])
     size = style.format_value(float(level["input_rms"]), unit)
-    realisations = f"{number} realisation" + ("s" if number > 1 else "")
-    return f"{size} rms, {realisations}, {periods} period" + ("s" if periods > 1 else "")
+    return f"{size} rms, {number_of(number, 'realisation')}, {number_of(periods, 'period')}"
 
 
 def _distortion_words(level: xr.Dataset) -> str:

@@ -35,7 +35,7 @@ from bayesoleo._parallel import available_cores, thread_limit
 from bayesoleo._storage.files import only_writer
 from bayesoleo._storage.resume import Arrays, Slots
 from bayesoleo._types import Array, Bool, Flags, Float, Int, Integers
-from bayesoleo.errors import InputError, import_extra
+from bayesoleo.errors import InputError, import_extra, number_of
 from bayesoleo.posterior._diagnostics import Samples
 from bayesoleo.posterior._gradient import Differentiable, Gradient, gradient_of
 from bayesoleo.posterior._log_density import Density
@@ -488,7 +488,7 @@ def _modes_apart(trace: Trace) -> list[str]:
     if min(been) == len(mixture.centres):
         return []
     return [
-        f"a chain has been to {min(been)} of {len(mixture.centres)} known modes, so that their"
+        f"a chain has been to {min(been)} of {number_of(len(mixture.centres), 'known mode')}, so that their"
         " weights are not known: the sampler ensemble moves between modes"
     ]
 

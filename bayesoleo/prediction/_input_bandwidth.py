@@ -323,6 +323,6 @@ def _masked(record: Record, channel: str, item: Smoothed) -> Iterator[Lost]:
         return
     size, noise = float(np.sqrt(np.mean(np.square(missed)))), record.signal_noise[channel]
     held = float(np.std(record.samples[channel][record.kept]))
-    if size > max(_MISSED * noise, _PART * held):
+    if size > np.fmax(_MISSED * noise, _PART * held):
         step = (record.time[-1] - record.time[0]) / (record.time.size - 1)
         yield Lost(record.label, channel, "masked", 0, size, held, float(longest * step))

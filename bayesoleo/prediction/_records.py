@@ -188,7 +188,7 @@ class Record:
         Significant harmonics of each channel (periodic runs).
     signal_noise : mapping of str to float
         Standard deviation of a single sample about the periodic mean, of a transient about the
-        smooth curve behind it, SI.
+        smooth curve behind it, SI; not a number for a held channel of which nothing tells it.
     conditions, condition_sd : mapping of str to float
         Known constants of the run, SI; standard deviation where declared.
     dropped_periods : int

@@ -122,7 +122,8 @@ class SegmentedRun:
         """First guess of each output's standard deviation, shape (ny,)."""
         known = [self.record.signal_noise.get(name, 0.0) for name in self.outputs]
         least = LEAST_NOISE * np.std(self.measured, axis=1)
-        return np.maximum(np.maximum(known, least), np.finfo(float).tiny)
+        # Of an output whose noise is unknown, not a number, the least stands.
+        return np.maximum(np.fmax(known, least), np.finfo(float).tiny)
 
     def base_constants(self) -> Array:
         """Nominal parameters and this run's conditions, shape (np,)."""

@@ -32,6 +32,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from bayesoleo._types import Array, Complex, ComplexArray, Float
+from bayesoleo.errors import number_of
 from bayesoleo.solvers._collocation import Collocation
 from bayesoleo.solvers._orbit import Orbit, Status, floquet_multipliers
 from bayesoleo.solvers._periodic import Boundary
@@ -294,7 +295,8 @@ class Branch:
 
     def __repr__(self) -> str:
         """Its ends and special orbits, a line each; of many the first."""
-        head = f"branch of {len(self.points)} orbits, {self.status.name.lower().replace('_', ' ')}"
+        status = self.status.name.lower().replace("_", " ")
+        head = f"branch of {number_of(len(self.points), 'orbit')}, {status}"
         if not self.points:
             return head
         shown = (

@@ -14,7 +14,7 @@ import numpy as np
 
 from bayesoleo._compiled import PiecewiseEquations
 from bayesoleo._types import Array, Bool, Flags, Float
-from bayesoleo.errors import InputError
+from bayesoleo.errors import InputError, number_of
 from bayesoleo.solvers import _march as loop
 from bayesoleo.solvers._march import DEGENERATE, FINISHED, LOST, NOT_A_NUMBER, OUTSIDE
 from bayesoleo.solvers._orbit import Status
@@ -299,7 +299,8 @@ def _check(dynamics: Dynamics, start: Array, times: Array, stages: int) -> None:
     if stages not in (3, 5):
         raise InputError("no such method", key="stages", value=stages, hint="use 3 or 5")
     if start.shape != (dynamics.size,):
-        hint = f"give {dynamics.size} numbers: each dof's value, and its velocity at second order"
+        numbers = number_of(dynamics.size, "number")
+        hint = f"give {numbers}: each dof's value, and its velocity at second order"
         raise InputError("the start does not fit", key="start", value=start.shape, hint=hint)
     if times.size < 2 or not times[-1] > times[0]:
         raise InputError("times must rise", key="times", value=times[:4], hint="give two or more")

@@ -35,7 +35,7 @@ BAD_FILES = {
     "NaN": (bad_rows(1, 30, np.nan), "file slow.csv, run slow, column f_N: 1 missing value"),
     "gap": (
         np.delete(rows(1.0), 30, axis=0),
-        "column time_s: gap of 1 missing sample(s) after 0.29",
+        "column time_s: gap of 1 missing sample after 0.29",
     ),
     "time back": (bad_rows(0, 30, 0.1), "run slow, column time_s: time does not increase"),
     "constant": (bad_rows(1, slice(None), 3.0), "run slow, column f_N: channel is constant (got 3"),

@@ -51,7 +51,7 @@ def test_some_failed(run, campaign, model, tmp_path, reasons):
     result = run(*arguments)
     assert result.exit_code == 1
     assert "failed    rig/spring/seed-1: run slow: too short" in result.stdout
-    assert "1 of 2 tasks are done" in result.stdout
+    assert "1 of 2 tasks is done" in result.stdout
     assert result.stderr == "rig/spring/seed-1 failed: run slow: too short\n"
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from bayesoleo._units import check_kind, parse_unit, same_quantity
+from bayesoleo._units import angle_hint, check_kind, parse_unit, same_quantity
 from bayesoleo.errors import CampaignError
 
 UNITS = [
@@ -117,3 +117,32 @@ def test_a_torque_may_be_called_an_energy_but_no_force():
     assert same_quantity("N*m", "J")
     assert same_quantity("J", "J")
     assert not same_quantity("N*m", "N")
+
+
+@pytest.mark.parametrize("given", ["1/min", "min**-1", "1/s", "Hz", "kHz", "1 / min"])
+def test_events_of_an_angle_are_turns_or_radians(given):
+    """Each unit that is proposed is in rad/s, and the two differ by one turn."""
+    hint = angle_hint(given, "rad/s")
+    assert hint.startswith(f"{given} counts events, rad/s measures an angle")
+    turns, radians = (parse_unit(name) for name in re.findall("'([^']+)'", hint))
+    assert (turns.si_name, radians.si_name) == ("rad/s", "rad/s")
+    assert turns.factor == pytest.approx(2 * np.pi * parse_unit(given).factor, rel=1e-12)
+    assert radians.factor == pytest.approx(parse_unit(given).factor, rel=1e-12)
+
+
+def test_revolutions_a_minute_are_proposed_by_their_usual_name():
+    assert "'rpm' if each event is a turn" in angle_hint("1/min", "rad/s")
+
+
+@pytest.mark.parametrize("wanted", ["Hz", "1/s"])
+@pytest.mark.parametrize("given", ["rpm", "rad/s", "deg/s"])
+def test_an_angle_where_events_are_counted_is_told(given, wanted):
+    assert "declare the model in rad/s" in angle_hint(given, wanted)
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [("mm", "rad/s"), ("Hz", "1/s"), ("rpm", "rad/s"), ("N*m", "N*m/rad"), ("%", "rad")],
+)
+def test_other_units_differ_by_no_angle(given, wanted):
+    assert angle_hint(given, wanted) == ""

@@ -81,7 +81,7 @@ def test_errors_of_the_catalogue_are_not_chosen_where_priors_would_decide(tmp_pa
     assert found.error_model == "power"
     assert "100% of the signal of force" in found.reason
     # More than noise is left there, and that is not denied.
-    assert "although more than noise is left" in found.reason
+    assert "although effects of the catalogue explain the residual better" in found.reason
     assert "no more than noise" not in found.reason
     monkeypatch.setattr(
         inference,

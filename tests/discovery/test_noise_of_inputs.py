@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from bayesoleo.data import SimulatedRun, load_campaign, reduce_campaign, write_campaign
 from bayesoleo.discovery._assembly import Assembly
 from bayesoleo.discovery._fit import fit_model
-from bayesoleo.discovery._inference import Inference, _by_spectra, chosen_for, mode_of
+from bayesoleo.discovery._inference import _PLAIN, Inference, _by_spectra, chosen_for, mode_of
 from bayesoleo.discovery._noise_of_estimates import NoiseOfEstimates
 from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.model import Dof, Model, Output, Parameter
@@ -206,11 +206,11 @@ def test_no_more_than_noise_is_not_said_where_more_is_left(tmp_path):
 
 
 def test_what_no_effect_explains_is_not_called_noise():
-    white = "independent errors, chosen because the noise is white, and no more than noise is left"
+    white = f"independent errors, chosen because {_PLAIN}"
     known = NoiseOfEstimates(np.eye(1), np.eye(1), beyond=True)
     word, reason = _by_spectra(known, "independent", white, asked=True)
     assert word == "power"
-    assert "more than noise is left, and no effect of the catalogue explains it" in reason
+    assert "because more than noise is left in the fitted runs, and no effect of" in reason
     assert _by_spectra(replace(known, beyond=False), "independent", white) == ("independent", white)
     word, reason = _by_spectra(replace(known, coloured={"y": 0.0}), "independent", white)
     assert word == "spectral"

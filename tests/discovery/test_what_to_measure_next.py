@@ -331,7 +331,9 @@ def test_a_transient_is_varied_by_its_start():
     found = propose_runs([rival], records, state.fit_errors, aim="stiffness", jobs=1)
     best = found.trials[0]
     assert best.like
-    assert best.change.startswith("start ×")
+    factor, _, what = best.change.partition(" times its ")
+    assert what == "distance from rest at the start"
+    assert float(factor) > 0
     # The information on the stiffness rises with the square of the start: the largest is best.
     largest = max(found.trials, key=lambda t: _start_of(t, {"a": 0.1, "bb": 0.2}))
     assert _start_of(best, {"a": 0.1, "bb": 0.2}) == pytest.approx(
@@ -339,6 +341,43 @@ def test_a_transient_is_varied_by_its_start():
     )
     assert _start_of(best, {"a": 0.1, "bb": 0.2}) <= REACH * 0.2 * 1.05
     assert best.information > found.best_repeat.information
+
+
+def test_words_say_of_what_a_variation_is_a_multiple():
+    """Against the records that are made: of where the run began that one is like, and how long."""
+    records = {label: free_decay(label, begun) for label, begun in (("a", 0.1), ("bb", 0.002))}
+    pushed = {
+        label: replace(
+            record,
+            samples=record.samples | {"push": (1.0 + k) * (record.time - record.time[0])},
+            smoothed=record.smoothed | {"push": _ramp(record, 1.0 + k)},
+            signal_noise={**record.signal_noise, "push": 0.0},
+        )
+        for k, (label, record) in enumerate(records.items())
+    }
+    model = replace(decay_model(), inputs={"push": "N"})
+    found, seen = varied_runs(list(pushed.values()), model, ("place",)), set()
+    for item in found:
+        like, made = pushed[item.like], item.record
+        sizes = {
+            "distance from rest at the start": item.start,
+            "duration": made.span / like.span,
+            "change of push since the first sample": np.ptp(made.samples["push"])
+            / np.ptp(like.samples["push"]),
+        }
+        told = dict(part.split(" times its ")[::-1] for part in item.change.split(", "))
+        seen |= set(told)
+        for what, size in sizes.items():
+            # Three digits are told; what differs from one by less than a fiftieth is not.
+            assert float(told.get(what, 1.0)) == pytest.approx(size, rel=0.021)
+    assert seen == set(sizes)
+
+
+def _ramp(record, slope):
+    from bayesoleo.prediction._band_limited import band_limited
+
+    step = float(record.time[1] - record.time[0])
+    return band_limited(slope * (record.time - record.time[0]), step)
 
 
 @pytest.mark.parametrize("labels", [("a",), ("a", "bb")])
@@ -428,7 +467,7 @@ def test_another_process_judges_runs_alike(monkeypatch):
 
 
 def _start_of(trial, starts):
-    factor = float(trial.change.rpartition("×")[2]) if "start" in trial.change else 1.0
+    factor = float(trial.change.partition(" ")[0]) if "start" in trial.change else 1.0
     return factor * starts[trial.like]
 
 

@@ -8,8 +8,9 @@ import pytest
 
 from bayesoleo import _schema as schema
 from bayesoleo._report import tables as yardstick
-from bayesoleo._report.sentences import headline, headline_parts
+from bayesoleo._report.sentences import error_model, headline, headline_parts
 from bayesoleo._workflow.settings import Settings
+from bayesoleo.discovery import _inference as inference
 from bayesoleo.discovery._work import ENDED
 from bayesoleo.effects import catalogue
 from bayesoleo.effects._catalogue import called, in_sentence, parameter_called, with_titles
@@ -116,8 +117,12 @@ def test_a_quick_search_that_went_no_further_says_so(names):
     summary = summary_of(names, sure, ratio=3.0, verdict=schema.UNEXPLAINED)
     summary["rounds"] = [*summary["rounds"][:-1], {**summary["rounds"][-1], "reason": ENDED}]
     text = headline(summary)
-    assert text == f"{plain} The quick search ended there: without --quick it goes on."
-    assert headline_parts(summary)[1].endswith("without --quick it goes on.")
+    on = "without --quick (in Python quick=False) it goes on."
+    assert text == f"{plain} The quick search ended there: {on}"
+    assert headline_parts(summary)[1].endswith(on)
+    # Results of earlier versions have the reason in other words after the semicolon.
+    summary["rounds"][-1]["reason"] = "a quick search goes no further; without --quick it looks"
+    assert headline(summary) == text
 
 
 def test_a_run_that_alone_is_too_large_is_named():
@@ -213,13 +218,14 @@ def test_the_title_of_a_page_is_short_and_nothing_is_lost(sure, count):
         summary = summary_of(names, sure, ratio=2.0, verdict=verdict, alike=["play @ x"])
         title, rest = headline_parts(summary)
         whole = headline(summary)
-        assert not rest.startswith("Explaining")
+        assert not rest.startswith(("Explaining", "And", "But"))
         whole = whole.replace(
             ", explaining", f", {'It explains' if count == 1 else 'They explain'}"
         )
         assert whole.startswith(title[:-1])
         assert whole.endswith(rest[1:])
-        assert len(title) + len(rest) >= len(whole) - 2
+        # No more than a conjunction between the two is left out.
+        assert len(title) + len(rest) >= len(whole) - len(", and ")
         assert len(title) < 110 + 45 * count
         assert title.endswith(".")
 
@@ -239,3 +245,51 @@ def test_the_title_of_a_page_is_short_and_nothing_is_lost(sure, count):
 def test_parameters_of_an_effect_are_called_by_its_title(label, words):
     assert parameter_called(label, {"my_law": "Law of mine"}) == words
     assert called(f"varies_by_run @ {label}", {"my_law": "Law of mine"}).endswith(f"({words})")
+
+
+REASONS = {
+    "white": f"independent errors, chosen because {inference._PLAIN}",
+    "inputs": f"spectral errors, chosen because {inference._BY_INPUTS}",
+    "effects": f"catalogue errors, chosen because {inference._LEFT.format(7.0)}",
+    "beyond": f"power errors, chosen because {inference._BEYOND}",
+    "undecided": f"catalogue errors, chosen because {inference._UNDECIDED.format('drag')}",
+    "priors": inference._NO_MORE.format("power", inference._LEFT.format(7.0), 1.0, "force", ""),
+}
+
+
+@pytest.mark.parametrize("why", REASONS)
+@pytest.mark.parametrize("sure", [*schema.CERTAINTIES, None])
+@pytest.mark.parametrize(
+    "verdict", [schema.EFFECT_ADDED, schema.UNEXPLAINED, schema.NOTHING_MISSING]
+)
+@pytest.mark.parametrize("pooled", [1.0, 3.0])
+@pytest.mark.parametrize("single", [1.0, 3.0])
+@pytest.mark.parametrize("role", [schema.FIT, schema.HOLD_OUT])
+def test_headline_and_errors_say_one_thing(why, sure, verdict, pooled, single, role):
+    """Of every size of the errors, over all runs of a role and in one of them."""
+    summary = summary_of(["coulomb_friction @ x"] if sure else [], sure, verdict=verdict)
+    fine = {"ratio_to_noise": 1.0, "repeating": 1.0, "rms": 1.0}
+    summary["error_after"] = {role: {"force": fine | {"ratio_to_noise": pooled}}}
+    summary["rounds"][-1]["error"] = {
+        "force": {"a": fine | {"ratio_to_noise": single, "role": role}}
+    }
+    text = headline(summary)
+    errors = error_model({schema.ERROR_MODEL_REASON: REASONS[why]}, summary)
+    large = max(pooled, single) > 2
+    if large:
+        assert "the error of force" in text
+        assert "down to" not in text
+    none = "no more than noise is left in the fitted runs" in errors
+    more = "more than noise is left in the fitted runs" in errors and not none
+    assert not (more and "down to" in text)
+    assert not (none and large and role == schema.FIT)
+    # Both are said where nothing speaks against it.
+    assert none == (why in ("white", "inputs") and not (large and role == schema.FIT))
+    assert more == (why == "beyond" and large and role == schema.FIT)
+
+
+@pytest.mark.parametrize("verdict", [schema.EFFECT_ADDED, schema.UNEXPLAINED])
+@pytest.mark.parametrize("sure", schema.CERTAINTIES)
+def test_the_rest_of_a_headline_begins_without_a_conjunction(sure, verdict):
+    summary = summary_of(["coulomb_friction @ x"], sure, ratio=3.0, verdict=verdict)
+    assert headline_parts(summary)[1].startswith(("The error of force", "It explains most of"))

@@ -54,6 +54,11 @@ def test_what_is_told_of_the_best_run_is_what_it_was_ranked_by():
     assert "more than 0.50" in proposal_lines(given)[1]
 
 
+def test_a_repetition_that_tells_as_much_is_told_as_such():
+    given = entry(repeat=trial({("a", "b"): 9.0}, 0.02, "run 3", 0.899))
+    assert proposal_lines(given)[1].endswith("; run 3, made once more, as much.")
+
+
 def test_a_repetition_that_tells_more_than_any_new_run_is_told_first():
     line = proposal_lines(entry(repeat=trial({("a", "b"): 9.0}, 0.02, "run 3", 0.95)))[1]
     assert line.startswith("run 3, made once more, is expected to tell 0.95 bits")
@@ -116,14 +121,23 @@ def test_three_effects_of_a_rival_are_seen_as_one():
 
 
 def test_a_variation_of_a_measured_run_is_told_by_what_it_changes():
-    runs = [trial({("a", "b"): 3.0}) | {"like": "drop 2", "change": "force × 1.2, duration × 2"}]
+    runs = [
+        trial({("a", "b"): 3.0})
+        | {"like": "drop 2", "change": "1.2 times its amplitude of force, 2 times its duration"}
+    ]
     repeat = trial({("a", "b"): 1.0}, run="drop 1", information=0.2)
     repeat |= {"like": "drop 1", "change": "", "frequency": None, "mean": None, "amplitude": None}
     given = entry(runs=runs, repeat=repeat, drive=None)
-    assert "like drop 2 with force × 1.2, duration × 2 is" in proposal_lines(given)[1]
+    assert (
+        "like drop 2 with 1.2 times its amplitude of force, 2 times its duration is"
+        in proposal_lines(given)[1]
+    )
     table = proposal_table(given)
     assert table.head[:3] == ["run", "as run", "changed"]
-    assert [row[2] for row in table.rows] == ["force × 1.2, duration × 2", "nothing"]
+    assert [row[2] for row in table.rows] == [
+        "1.2 times its amplitude of force, 2 times its duration",
+        "nothing",
+    ]
 
 
 def test_of_parameters_the_most_improved_are_told():

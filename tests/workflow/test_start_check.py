@@ -10,9 +10,9 @@ from small_campaigns import damper, damper_campaign
 
 from bayesoleo import Campaign, _workflow as workflow
 from bayesoleo._workflow.settings import Settings
-from bayesoleo._workflow.task import StartCheck, about_start
-from bayesoleo.data import CampaignData
-from bayesoleo.errors import DataWarning, ModelError
+from bayesoleo._workflow.task import StartCheck, about_start, drive_not_followed
+from bayesoleo.data import CampaignData, SimulatedRun, load_campaign, write_campaign
+from bayesoleo.errors import CampaignError, DataWarning, ModelError
 from bayesoleo.model import Model, Output, Parameter
 from bayesoleo.prediction import RunPlan, motion
 from bayesoleo.systems import system
@@ -140,8 +140,79 @@ def test_a_dof_that_nothing_holds_is_refused_in_periodic_runs(campaign, tmp_path
     """Only its rate is determined: the linearised equations of any motion would be singular."""
     with pytest.raises(ModelError, match=r"nothing holds 'place'.*periodic run such as a.*initial"):
         workflow.check(campaign, rotor(), Settings(jobs=1))
-    with pytest.raises(ModelError, match="declare its rate, in m/s, as the dof, of first order"):
+    with pytest.raises(ModelError, match="or declare its rate, in m/s, as the dof, of first order"):
         workflow.check(campaign, rotor(), Settings(jobs=1))
     workflow.check(campaign, rotor("+ pull*place"), Settings(jobs=1))
     transient = damper_campaign(tmp_path, transient=True).campaign
     workflow.check(transient, rotor(), Settings(jobs=1))
+
+
+def test_a_dof_of_first_order_that_nothing_holds_is_left_out_instead(campaign):
+    """Its rate cannot be made a dof of first order: the dof is of first order already."""
+    model = rotor()
+    equations = {"place": {"drag": "drag*dot(place)", "drive": "-pull*displacement"}}
+    first = replace(model, equations=equations)
+    with pytest.raises(ModelError, match=r"or leave 'place' out and solve its equation") as caught:
+        workflow.check(campaign, first, Settings(jobs=1))
+    assert "first order" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("controlled", "told"),
+    [
+        ("displacement", ""),  # its own input
+        (None, ""),
+        ("force", "an output of model 'rotor' that no input can be exchanged for"),
+        ("torque", "neither an input nor an output of model 'rotor'"),
+    ],
+)
+def test_a_controlled_channel_that_cannot_drive_is_told(campaign, controlled, told):
+    # Its only output does not depend on the motion: no displacement belongs to it.
+    model = replace(rotor("+ pull*place"), outputs={"force": Output("pull", "N")})
+    found = drive_not_followed(model, replace(campaign, controlled=controlled), None)
+    assert len(found) == bool(told)
+    for text in found:
+        assert f"controlled = '{controlled}', which is {told}" in text
+        assert "driven by displacement. It can be driven by one of: displacement." in text
+    assert drive_not_followed(model, replace(campaign, controlled=controlled), "model") == []
+
+
+def test_an_output_that_can_be_exchanged_drives_without_a_word(campaign):
+    spring = Model(
+        "spring",
+        inputs={"force": "N"},
+        dofs={"x": "m"},
+        parameters={"stiffness": Parameter(1e4, "N/m", relative_sd=0.5)},
+        equations={"x": "ddot(x) + stiffness*x - force"},
+        outputs={"displacement": Output("x", "m")},
+    )
+    assert drive_not_followed(spring, replace(campaign, controlled="displacement"), None) == []
+
+
+def test_a_campaign_warns_of_a_controlled_channel_that_cannot_drive(campaign):
+    wrong = replace(campaign, controlled="force")
+    model = rotor("+ pull*place")  # of which the force follows the velocity
+    with pytest.warns(DataWarning, match=r"controlled = 'force'.*driven by displacement"):
+        workflow.check(wrong, model, Settings(jobs=1))
+
+
+def test_turns_in_a_channel_of_radians_are_told(tmp_path):
+    motor = Model(
+        "motor",
+        inputs={"torque": "N*m"},
+        dofs={"speed": "rad/s"},
+        parameters={
+            "inertia": Parameter(1.0, "kg*m**2", fixed=True),
+            "drag": Parameter(0.5, "N*m*s", relative_sd=0.5),
+        },
+        equations={"speed": "inertia*dot(speed) + drag*speed - torque"},
+        outputs={"shown": Output("speed", "rad/s")},
+    )
+    time = 0.01 * np.arange(200)
+    samples = {"torque": np.sin(time), "shown": 0.3 * np.sin(time - 1.0)}
+    run = SimulatedRun("a", time, samples, None, kind="transient")
+    channels = {"torque": ("t", "N*m"), "shown": ("n", "1/min")}
+    write_campaign(tmp_path, name="n", channels=channels, runs=[run])
+    message = r"channels\.shown\.unit.*expects rad/s \(got '?1/min'?\); .*unit = 'rpm'"
+    with pytest.raises(CampaignError, match=message):
+        workflow.prepare(load_campaign(tmp_path), motor, Settings(jobs=1))
