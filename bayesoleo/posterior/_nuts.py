@@ -12,8 +12,8 @@ been to one of them, their weights are not known, and the result says so.
 References
 ----------
 Hoffman and Gelman (2014), "The No-U-Turn Sampler", *Journal of Machine Learning Research* 15.
-Betancourt (2017), "A conceptual introduction to Hamiltonian Monte Carlo", section 6.2 (what a
-divergence tells). Seyboldt, Carlson and Carpenter (2026), "nutpie".
+Betancourt (2017), "A conceptual introduction to Hamiltonian Monte Carlo", section 6.2 (regions of
+high curvature).
 """
 
 from __future__ import annotations
