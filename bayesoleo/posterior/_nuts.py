@@ -248,8 +248,8 @@ class _Chains:
     def check(self, handle: Any) -> None:
         """Raise what a chain raised, also where nutpie itself has failed.
 
-        Methods of nutpie 0.16 that ask running chains (``wait``, ``inspect``, ``is_finished``) may
-        block for ever. They are not called while chains make progress.
+        Draws are noted here, so that nutpie is asked only where chains make no progress; its
+        ``is_finished`` raises a ``TimeoutError`` while they run (0.16).
         """
         if self.error is not None:
             raise self.error
