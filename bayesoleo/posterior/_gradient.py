@@ -17,8 +17,7 @@ steps need the same vector at the same place, and are accepted by the density.
 References
 ----------
 Verbeek (1993), eqs. 2.29 and 3.19. Neal (2011), "MCMC using Hamiltonian dynamics", *Handbook of
-Markov Chain Monte Carlo*, sections 5.3.2 and 5.5 (what the gradient must be for the draws to be
-right).
+Markov Chain Monte Carlo*, section 5.5 (trajectories by approximations).
 """
 
 from __future__ import annotations

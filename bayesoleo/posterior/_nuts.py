@@ -12,8 +12,8 @@ been to one of them, their weights are not known, and the result says so.
 References
 ----------
 Hoffman and Gelman (2014), "The No-U-Turn Sampler", *Journal of Machine Learning Research* 15.
-Betancourt (2017), "A conceptual introduction to Hamiltonian Monte Carlo", section 6.2 (what a
-divergence tells). Seyboldt, Carlson and Carpenter (2026), "nutpie".
+Betancourt (2017), "A conceptual introduction to Hamiltonian Monte Carlo", section 6.2 (regions of
+high curvature).
 """
 
 from __future__ import annotations
@@ -249,8 +249,8 @@ class _Chains:
     def check(self, handle: Any) -> None:
         """Raise what a chain raised, also where nutpie itself has failed.
 
-        Methods of nutpie 0.16 that ask running chains (``wait``, ``inspect``, ``is_finished``) may
-        block for ever. They are not called while chains make progress.
+        Draws are noted here, so that nutpie is asked only where chains make no progress; its
+        ``is_finished`` raises a ``TimeoutError`` while they run (0.16).
         """
         if self.error is not None:
             raise self.error

@@ -2,11 +2,12 @@
 
 import sys
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from linear_runs import hierarchical_quadrature
-from posterior_gas_spring import gas_spring, quadrature
+from posterior_gas_spring import GasSpring, gas_spring, measured, quadrature
 from posterior_targets import Gaussian
 from test_hierarchical_runs import RUNS, density_of, problem_of, told
 from test_posterior_sample import normal_mixture, within_error
@@ -15,6 +16,7 @@ from bayesoleo.errors import InputError, MissingExtraError, ResultsError
 from bayesoleo.estimation import FunctionProblem
 from bayesoleo.model._priors import Normal
 from bayesoleo.posterior import LogDensity, MoveWeights, _nuts, laplace_mixture, sample, to_datasets
+from bayesoleo.solvers._orbit import Status
 
 pytest.importorskip("nutpie")
 
@@ -115,6 +117,34 @@ def test_divergences_are_counted_and_told():
     assert stats.attrs["divergences"] == samples.divergences
     np.testing.assert_array_equal(stats["diverging"].values, samples.diverging)
     assert samples.thinned(50).diverging.shape == samples.thinned(50).log_density.shape
+
+
+class Failing(GasSpring):
+    """Has no solution above an exponent that the posterior reaches."""
+
+    most = 1.2275
+
+    def evaluate(self, theta):
+        found = super().evaluate(theta)
+        return found if theta[0] < self.most else replace(found, status=Status.NO_CONVERGENCE)
+
+    def misfit(self, theta):
+        found = super().misfit(theta)
+        found.status[theta[:, 0] >= self.most] = Status.NO_CONVERGENCE
+        return found
+
+
+def test_failed_solves_are_counted_by_reason_whatever_the_threads():
+    problem = Failing(measured(1), Normal(1.0, 0.1))
+    start = laplace_mixture(LogDensity(problem), np.array([[1.22]]))
+    found = [
+        by_nuts(LogDensity(problem, jobs), start, effective_size=100, quick=True) for jobs in (1, 4)
+    ]
+    assert found[0].failures["no_convergence"] > 0
+    assert found[0].failures == found[1].failures
+    assert found[0].divergences == found[1].divergences > 0
+    assert (found[0].draws[:, :, 0] < problem.most).all()
+    assert np.isfinite(found[0].log_density).all()
 
 
 def test_modes_apart_are_told():
