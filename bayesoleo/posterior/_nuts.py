@@ -488,8 +488,8 @@ def _modes_apart(trace: Trace) -> list[str]:
     if min(been) == len(mixture.centres):
         return []
     return [
-        f"a chain has been to {min(been)} of {number_of(len(mixture.centres), 'known mode')}, so that their"
-        " weights are not known: the sampler ensemble moves between modes"
+        f"a chain has been to {min(been)} of {number_of(len(mixture.centres), 'known mode')}, so"
+        " that their weights are not known: the sampler ensemble moves between modes"
     ]
 
 
