@@ -423,7 +423,7 @@ def serves(trace: Trace, schedule: Schedule) -> bool:
     """Whether a run that was stored is what would be drawn again."""
     draws = trace.coords.shape[1]
     ahead = trace.spent * decisions(schedule.least, draws)[-1] / draws
-    spent = ahead > schedule.max_evaluations
+    spent = ahead > schedule.max_evaluations or draws == MOST_DRAWS
     return spent or not trace.quality.shortfalls(schedule, len(trace.coords))
 
 
@@ -446,7 +446,8 @@ def samples_of(trace: Trace, log_density: Density, schedule: Schedule, *, quick:
     height, by_run = log_density(rows)
     short = quality.shortfalls(schedule, chains, "chains")
     if short:
-        short.insert(0, f"stopped before {schedule.max_evaluations} evaluations")
+        most = f"before {schedule.max_evaluations} evaluations"
+        short.insert(0, f"stopped {f'after {draws} draws' if draws == MOST_DRAWS else most}")
     short += _modes_apart(trace)
     said = [*short, *_divergences(trace)]
     if not np.isfinite(height).all():

@@ -224,6 +224,13 @@ def test_a_budget_ends_it_and_is_told():
     assert "stopped before 8000 evaluations; the effective size is" in samples.warning
 
 
+def test_so_many_draws_end_it_and_are_told(monkeypatch):
+    monkeypatch.setattr(_nuts, "MOST_DRAWS", 70)
+    samples = by_nuts(Steep(np.ones(2)), normal_mixture(np.ones(2)), effective_size=1e5)
+    assert samples.draws.shape[1] == 70
+    assert samples.warning.startswith("stopped after 70 draws; the effective size is")
+
+
 @pytest.mark.parametrize(
     ("key", "value"), [("walkers", 20), ("weights", MoveWeights()), ("scheduler", "local:2")]
 )
