@@ -20,6 +20,7 @@ from bayesoleo._types import Array
 from bayesoleo.data._fourier import HarmonicBasis
 from bayesoleo.data._harmonics import foreign_lines
 from bayesoleo.data._noise import average_on, periodic_average
+from bayesoleo.data._quiet_channels import noise_of_channels, quiet_channels
 from bayesoleo.data._sample_quality import clipped, coarse_steps, repeating_rounding
 from bayesoleo.prediction._records import Disturbances, Record
 
@@ -247,10 +248,25 @@ def data_warnings(records: Sequence[Record], units: Mapping[str, str] | None = N
         for item in drifting(record)
     ]
     found += _about_removed(records, known)
+    found += _about_quiet(records, known)
     for record, doubts in zip(records, periods, strict=True):
         # Lines between the harmonics of a wrong frequency are harmonics of the true one.
         found += [] if doubts else _about_channels(record, known)
     return found + _about_pieces(records)
+
+
+def _about_quiet(records: Sequence[Record], units: Mapping[str, str]) -> list[str]:
+    """Channels of transients that count as constant, because they show noise alone."""
+    noise = noise_of_channels(records)
+    runs: dict[str, list[str]] = {}
+    for record in records:
+        for channel in quiet_channels(record, noise):
+            runs.setdefault(channel, []).append(record.label)
+    return [
+        f"{_runs(labels)}: {channel} shows nothing but the noise that its sensor has in other runs,"
+        f" {noise[channel]:.3g}{_unit(units, channel)}; it counts as constant there"
+        for channel, labels in runs.items()
+    ]
 
 
 def _about_pieces(records: Sequence[Record]) -> list[str]:

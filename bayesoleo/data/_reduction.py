@@ -27,6 +27,7 @@ from bayesoleo.data._noise import (
     periodic_average,
     scatter_about_levels,
 )
+from bayesoleo.data._quiet_channels import with_quiet_channels
 from bayesoleo.data._residual_time_shift import Frequency, find_frequency
 from bayesoleo.data._run_samples import Run
 from bayesoleo.data._sample_quality import (
@@ -168,7 +169,8 @@ def reduce_campaign(
         If a run does not repeat near its declared frequency, or holds fewer than two periods.
     """
     if not progress:
-        return ReducedCampaign(campaign, tuple(thread_map(reduce_run, campaign.runs, jobs)))
+        records = tuple(thread_map(reduce_run, campaign.runs, jobs))
+        return ReducedCampaign(campaign, with_quiet_channels(records))
     from tqdm.auto import tqdm
 
     delay = 0.0 if progress is True else progress
@@ -180,7 +182,7 @@ def reduce_campaign(
             return record
 
         records = tuple(thread_map(reduce_and_count, campaign.runs, jobs))
-    return ReducedCampaign(campaign, records)
+    return ReducedCampaign(campaign, with_quiet_channels(records))
 
 
 @single_blas_thread()  # matrices are small: threads take longer to meet than to work

@@ -13,6 +13,7 @@ import numpy as np
 
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import Roles
+from bayesoleo.discovery._by_other_drive import misleads, with_suggestions
 from bayesoleo.discovery._fit_and_hold_out_error import least_noise
 from bayesoleo.discovery._fit_difference import undecided
 from bayesoleo.discovery._hold_out_confirmation import confirmed
@@ -130,6 +131,8 @@ def examine(
     if stop is not None or limit:
         return Round(state, ranking, failed, None, None, stop or limit, tests, _scanned=scanned)
     refits = _refit_best(base, ranking, tests, numerics, callback)
+    if misleads(state, refits):
+        refits = with_suggestions(state, base, ranking, refits, effects, numerics, callback)
     ranking = rank(scores, tests, refits, base=base, policy=policy)
     fitted: dict[int, State] = {}
     accepted, after, reason = _choose(

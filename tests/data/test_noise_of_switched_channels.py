@@ -11,7 +11,7 @@ from scipy.signal import chirp, lfilter
 from bayesoleo.data import SimulatedRun, load_campaign, reduce_campaign, write_campaign
 from bayesoleo.data._noise import jumps, noise_beside_jumps, scatter_about_levels
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._fit import Numerics
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.model import Model, Output, Parameter
 

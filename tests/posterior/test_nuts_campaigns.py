@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from test_gradient import differences, whitening
 
-from bayesoleo.discovery._fit import Numerics, fit_model
+from bayesoleo.discovery._fit import fit_model
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.estimation._problem import anchored_evaluation
 from bayesoleo.posterior import LogDensity, laplace_mixture, sample
 from bayesoleo.posterior._gradient import Gradient
