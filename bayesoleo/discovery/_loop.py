@@ -400,7 +400,8 @@ def probabilities(
     if not ranking or not all(item.score.signature.size for item in ranking):
         return None
     callback("compare structures")
-    refits = [item.refit for entry in progress.rounds for item in entry.ranking if item.refit]
+    items = [item for entry in progress.rounds for item in entry.ranking]
+    refits = [one for item in items for one in (item.refit, item.beside) if one is not None]
     known = [(one.assembly, one.fit) for one in refits if np.isfinite(one.share)]
     known += [(final.assembly, final.fit)] if final.assembly.steps else []
     # The noise is that which the best model has left.

@@ -8,7 +8,7 @@ the comparison. A candidate that does better beside the others replaces the effe
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -37,6 +37,8 @@ from bayesoleo.discovery._ranking import (
 from bayesoleo.discovery._refit import (
     Refit,
     fall_from,
+    new_parameters,
+    quick_fit,
     records_of,
     refit,
     refit_all,
@@ -49,6 +51,10 @@ from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._state import State, fit_state
 from bayesoleo.effects._effect import Effect
 from bayesoleo.effects._nonparametric import FAMILY
+from bayesoleo.errors import ModelError
+
+#: Parts of an effect that are left while another one takes its place.
+TAKEN_BACK = (0.8, 0.6, 0.4, 0.2, 0.1)
 
 
 @dataclass(frozen=True)
@@ -294,6 +300,9 @@ def place_of(
         # would seem to surpass.
         refits[id(own)] = refit_at(base, own, final.assembly, final.fit)
     refits |= _from_other_shapes(base, refits, chosen, numerics)
+    if same:
+        spanned = set(progress.rounds[-1].failed)
+        refits |= _in_exchange(final, step, base, refits, chosen, spanned, numerics)
     ranking = rank(scores, progress.rounds[number].tests, refits, base=base, policy=numerics.policy)
     mine = next(item for item in ranking if item.score is own)
     if mine.refit is None:
@@ -342,6 +351,67 @@ def _restarted(
         if np.isfinite(again.share) and again.fall > fall:
             better, fall, inflation = again, again.fall, again.inflation
     return None if better is None else replace(better, score=cast(Any, None))
+
+
+def _in_exchange(
+    final: State,
+    step: AddedEffect,
+    base: Base,
+    refits: Mapping[int, Refit],
+    chosen: Sequence[Score],
+    spanned: Set[str],
+    numerics: Numerics,
+) -> dict[int, Refit]:
+    """Better estimates of effects that the final model produces already, led from its estimate.
+
+    Near the final estimate such an effect says the same as the one that was added, in other words,
+    as an error of a mass and one of a force's gain do. Far from it, where the added effect is
+    absent, its score is poor and its estimate may end in another optimum: the two would seem to
+    differ. Here the added effect is taken back in parts, and the other follows.
+    """
+    own = chosen[0]
+    least = refits[id(own)].fall
+    found = {}
+    for score in chosen[1:]:
+        if f"{score.option.candidate.effect} at {score.option.candidate.target}" not in spanned:
+            continue
+        known = refits[id(score)]
+        if known.fall > least - base.policy.restart_gap * known.inflation:
+            continue
+        result = _led(final, step, base, score, numerics)
+        if result is not None and result.fall > known.fall:
+            found[id(score)] = result
+    return found
+
+
+def _led(
+    final: State, step: AddedEffect, base: Base, score: Score, numerics: Numerics
+) -> Refit | None:
+    """The estimate of an effect while another one is taken back; None where one step failed."""
+    added = score.option.assembly.steps[-1]
+    try:
+        both = final.assembly.option(added.effect, added.target, added.scales).assembly
+    except ModelError:  # they exclude each other
+        return None
+    new = new_parameters(both, score, base.policy)
+    known = {**{name: 0.0 for name in new if name not in score.shapes}, **final.fit.values}
+    both = both.with_values(final.fit.shared).with_parameters(new)
+    amounts = {name: final.fit.values.get(name) for name in step.amplitudes}
+    if None in amounts.values() or set(score.names) != set(new) - set(score.shapes):
+        return None  # values of single runs
+    for part in TAKEN_BACK:
+        present = both.model().parameters
+        held = {
+            name: replace(present[name], value=part * cast(float, amount), fixed=True)
+            for name, amount in amounts.items()
+        }
+        fit = quick_fit(base, both.with_parameters(held).model(), known, numerics)
+        if not all(np.isfinite(run.y).all() for run in fit.predictions):
+            return None
+        known |= fit.values
+    assembly = score.option.assembly.with_values(base.fit.shared)
+    assembly = assembly.with_parameters(new_parameters(assembly, score, base.policy))
+    return refit_at(base, score, assembly, quick_fit(base, assembly.model(), known, numerics))
 
 
 def _worth_estimating(
@@ -423,7 +493,18 @@ def _with_class(progress: Progress, place: Place) -> Progress:
     item = progress.rounds[place.number]
     assert item.accepted is not None
     new = replace(item.accepted, same=place.own.same, beside=place.own.refit)
-    ranking = tuple(new if one is item.accepted else one for one in item.ranking)
+    # What says the same in other words is as probable, by an estimate beside the same effects.
+    alike = {
+        (one.effect, one.target): one.refit
+        for one in place.rivals
+        if name_among(place.own.score, one.score) in place.own.same
+    }
+    ranking = tuple(
+        new
+        if one is item.accepted
+        else replace(one, beside=alike.get((one.effect, one.target), one.beside))
+        for one in item.ranking
+    )
     changed = replace(item, ranking=ranking, accepted=new)
     rounds = (*progress.rounds[: place.number], changed, *progress.rounds[place.number + 1 :])
     return replace(progress, rounds=rounds)

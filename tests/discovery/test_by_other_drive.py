@@ -136,3 +136,27 @@ def test_a_resonance_that_bends_over_and_free_decays_show_the_cubic_spring_alone
     k = loop.final.fit.problem.names.index("cubic_stiffness")
     point = loop.final.fit.point
     assert point.theta[k] == pytest.approx(CUBIC, abs=5 * point.sd[k])
+
+
+@pytest.mark.slow
+def test_what_says_the_same_in_other_words_is_as_probable_beside_another_effect(tmp_path):
+    """With a fixed mass that is wrong, all forces are wrong by one factor, as by a gain."""
+    reduced = reduce_campaign(load_campaign(duffing(tmp_path, 8.0, decays=False)), jobs=1)
+    light = MODEL.with_term("equation", "place", "less", "-0.25*ddot(place)")
+    loop = close_loop(Assembly(light, None), assign(reduced.records), Numerics(jobs=1))
+    assert loop.final.at_floor
+    same = {
+        ("mass_error", "place"), ("sensor_gain", "force"), ("sensor_gain", "displacement")
+    }  # fmt: skip
+    assert ("cubic_stiffness", "place") in loop.added
+    (own,) = same & set(loop.added)
+    accepted = next(
+        one.accepted for one in loop.rounds
+        if one.accepted and (one.accepted.effect, one.accepted.target) == own
+    )  # fmt: skip
+    told = {name.split(" @ ")[0] for name in accepted.same}
+    assert {effect for effect, _ in same - {own}} <= told
+    probable = loop.structures.effects
+    assert sum(probable[key] for key in same) > 0.9
+    # Priors of their sizes differ, their likelihoods do not.
+    assert max(probable[key] for key in same) < 0.8
