@@ -60,7 +60,7 @@ def test_what_was_found_before_the_last_effect_gets_the_class_that_it_has_beside
     found = progress_of(first, accepted("coulomb_friction", ("dahl_friction",)))
     estimate = object()
     own = replace(first, same=("play", "preload"), refit=estimate)
-    place = SimpleNamespace(number=0, own=own, better=())
+    place = SimpleNamespace(number=0, own=own, better=(), rivals=())
     monkeypatch.setattr(review, "place_of", lambda *_, **__: place)
     told = review.reviewed(found, None, None, None, lambda _: None, replacing=False).rounds
     assert told[0].accepted.same == ("play", "preload")
