@@ -20,14 +20,19 @@ from bayesoleo.prediction._records import Record
 #: Part of a channel's deviation that the floor of its spectrum is, from which the spectrum is flat:
 #: floors are estimated from the lowest part, and lie a tenth or two too low for short records.
 FLAT = 0.7
-#: Deviation over that of the sensor's noise up to which there is nothing else: noise of the same
-#: size as the sensor's would be 1.4.
+#: Deviation over that of the sensor's noise up to which there is nothing else: with a signal of the
+#: same size it would be 1.4, and a floor may be a tenth or two too low.
 NOTHING_ELSE = 1.25
+#: Part of a run's signal below which what does not repeat in it counts as noise of the sensor.
+LITTLE = 0.1
 
 
 def noise_of_channels(records: Sequence[Record]) -> dict[str, float]:
-    """Standard deviation of a sample by channel, as far as some run tells it: the middle one of
-    those that do, SI.
+    """Standard deviation of a sample by channel, as far as some run tells it, SI.
+
+    The smallest counts: what does not repeat in a run may be more than its sensor's noise, and a
+    sensor with a wider range may be noisier. Where it is not small against the signal it may be a
+    motion that does not repeat.
 
     Parameters
     ----------
@@ -38,9 +43,10 @@ def noise_of_channels(records: Sequence[Record]) -> dict[str, float]:
         for channel, noise in record.signal_noise.items():
             curve = record.smoothed.get(channel)
             told = record.periodic or (curve is not None and curve.noise > 0.0)
-            if told and np.isfinite(noise) and noise > 0.0:
+            size = float(np.std(record.samples[channel]))
+            if told and 0.0 < noise < LITTLE * size:
                 found.setdefault(channel, []).append(float(noise))
-    return {channel: float(np.median(values)) for channel, values in found.items()}
+    return {channel: min(values) for channel, values in found.items()}
 
 
 def quiet_channels(record: Record, noise: Mapping[str, float]) -> dict[str, float]:

@@ -29,6 +29,7 @@ from bayesoleo.discovery._state import State, state_of
 from bayesoleo.effects._effect import Effect
 from bayesoleo.errors import ModelError
 from bayesoleo.model._drive_and_start import possible_drives
+from bayesoleo.prediction._inputs import lacking
 
 #: Error over the expected one from which a prediction counts as far from the measurement, and the
 #: part of the excess that an estimate must explain where it is not.
@@ -77,7 +78,7 @@ def suggested(
     callback : callable
         Told what is being done.
     """
-    other = _with_fewer_motions(state.assembly)
+    other = _with_fewer_motions(state)
     if other is None:
         return []
     callback("the prediction is far from the data: candidates by the force along the motion")
@@ -107,18 +108,20 @@ def suggested(
     ]
 
 
-def _with_fewer_motions(assembly: Assembly) -> Assembly | None:
-    """The same assembly in the drive that leaves the fewest dofs, if fewer than its own."""
-    found, least = None, len(assembly.model().dofs)
+def _with_fewer_motions(state: State) -> Assembly | None:
+    """The same assembly in the drive that leaves the fewest dofs, if fewer than its own and all
+    runs have what drives it."""
+    assembly = state.assembly
+    found, least = None, len(state.fit.model.dofs)
     for channel in possible_drives(assembly.native):
         drive = None if channel in assembly.native.inputs else channel
+        other = replace(assembly, drive=drive)
         try:
-            other = replace(assembly, drive=drive)
-            dofs = len(other.model().dofs)
+            model = other.model()
         except ModelError:  # an effect on a channel that is no output there
             continue
-        if dofs < least:
-            found, least = other, dofs
+        if len(model.dofs) < least and not lacking(model.inputs, state.fit.records):
+            found, least = other, len(model.dofs)
     return found
 
 

@@ -20,7 +20,7 @@ SIGNALS = {
     "nothing": (lambda rng: np.zeros(SIZE), False),
     "an offset": (lambda rng: np.full(SIZE, 0.3), False),
     "a random force": (lambda rng: 3 * NOISE * rng.standard_normal(SIZE), True),
-    "a sine of the noise's size": (lambda rng: NOISE * np.sin(40 * TIME), True),
+    "a sine of twice the noise's size": (lambda rng: 2 * NOISE * np.sin(40 * TIME), True),
     "a blow": (lambda rng: np.exp(-(((TIME - 0.2) / 0.01) ** 2)), True),
     "slow drift": (lambda rng: 0.1 * TIME, True),
 }
@@ -81,3 +81,31 @@ def test_alone_a_flat_spectrum_may_be_that_of_a_force(tmp_path):
     _, force = force_of(reduced)
     assert np.std(force) > 0.9 * NOISE
     assert not any("counts as constant" in text for text in data_warnings(reduced.records))
+
+
+@pytest.mark.parametrize("repeats", [10.0, 9.5], ids=["settled", "not periodic"])
+def test_a_random_force_below_the_noise_of_stronger_runs_stays(tmp_path, repeats):
+    """The noise of a run with a large force may be of its amplifier: the smallest one counts. What
+    does not repeat where the motion does not is no noise."""
+    rng = np.random.default_rng(2)
+
+    def run(label, force, noise, frequency=None, repeats=10.0):
+        samples = {
+            "force": force + noise * rng.standard_normal(SIZE),
+            "place": np.sin(2 * np.pi * repeats * TIME) + 1e-3 * rng.standard_normal(SIZE),
+        }
+        kind = "periodic" if frequency else "transient"
+        return SimulatedRun(label, TIME, samples, frequency, kind=kind)
+
+    turn = 2 * np.pi * 10 * TIME
+    runs = [
+        run("decay", 0.3 * rng.standard_normal(SIZE), NOISE),
+        run("weak", np.sin(turn), NOISE, 10.0, repeats),
+    ]
+    if repeats == 10.0:
+        runs.append(run("strong", 50 * np.sin(turn), 50 * NOISE, 10.0))
+        runs.append(run("stronger", 99 * np.sin(turn), 99 * NOISE, 10.0))
+    channels = {"force": ("F", "N"), "place": ("x", "mm")}
+    write_campaign(tmp_path, name="levels", channels=channels, runs=runs)
+    record, force = force_of(reduce_campaign(load_campaign(tmp_path), jobs=1))
+    assert np.std(force) == pytest.approx(np.std(record.samples["force"]), rel=1e-6)
