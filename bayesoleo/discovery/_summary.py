@@ -36,6 +36,8 @@ _BOUND = 1.96
 MIXED = 0.01
 #: Draws for each of several parameters whose region is asked for.
 MANY = 10
+#: Gain of an input's sensor beyond which hardly anything of what it shows acts.
+IDLE = 8.0
 
 
 def summarise(
@@ -101,6 +103,7 @@ def summarise(
                 )
             ),
             *_input_noise_notes(final),
+            *_idle_inputs(final),
             *([slow_noise_text(slow)] if slow else []),
             *_sampler_notes(samples),
         ],
@@ -401,6 +404,23 @@ def _input_noise_notes(state: State) -> list[str]:
                 f"input noise dominates the noise of {output} in"
                 f" {number_of(len(entries), 'run')}: in run {worst.run} it is {times:.1f} times the"
                 " output's own"
+            )
+    return notes
+
+
+def _idle_inputs(state: State) -> list[str]:
+    """Say where a gain that an input was given leaves next to nothing of it."""
+    model, values = state.fit.model, state.fit.values
+    notes = []
+    for step in state.assembly.steps:
+        if step.effect.id != "sensor_gain" or step.target not in model.inputs:
+            continue
+        gain = 1.0 + values.get(step.amplitudes[0], 0.0)
+        if abs(gain) > IDLE:
+            notes.append(
+                f"the gain error of {step.target} leaves {100 / abs(gain):.2g} % of what the"
+                " channel shows to act on the model. A sensor that idles shows its noise alone:"
+                " where nothing acts, write zeros in its column"
             )
     return notes
 

@@ -9,7 +9,7 @@ import pytest
 
 from bayesoleo import _schema as schema
 from bayesoleo.discovery._loop import certainty_of, explained_by_physics, verdict_of
-from bayesoleo.discovery._summary import _may_be_absent
+from bayesoleo.discovery._summary import _idle_inputs, _may_be_absent
 
 
 def state(ratio, *families, floor=1.15, quiet=(), shift=0.05, expected=1.0):
@@ -151,3 +151,22 @@ def test_amplitudes_of_which_only_differences_are_known_are_judged_together(draw
     assert [("95 % region of its amplitudes" in note) for note in notes] == [True] * (
         difference == 0.3
     )
+
+
+@pytest.mark.parametrize(
+    ("effect", "target", "error", "told"),
+    [
+        ("sensor_gain", "force", 24.0, True),
+        ("sensor_gain", "force", -26.0, True),
+        ("sensor_gain", "force", 0.2, False),
+        ("sensor_gain", "place", 24.0, False),  # an output's gain says nothing of what acts
+        ("sensor_offset", "force", 24.0, False),
+    ],
+)
+def test_an_input_of_which_next_to_nothing_acts_is_told(effect, target, error, told):
+    step = Stub(effect=Stub(id=effect), target=target, amplitudes=("amount",))
+    fit = Stub(model=Stub(inputs={"force": "N"}), values={"amount": error})
+    state = Stub(fit=fit, assembly=Stub(steps=[step]))
+    found = _idle_inputs(state)
+    assert len(found) == told
+    assert all("leaves 4 % of what the channel shows" in note for note in found)
