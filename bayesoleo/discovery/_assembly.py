@@ -16,6 +16,7 @@ import numpy as np
 
 from bayesoleo.effects._catalogue import candidates, catalogue
 from bayesoleo.effects._effect import Candidate, Effect
+from bayesoleo.effects._forces import ARCTANGENT, has_corner, with_corner
 from bayesoleo.effects._parts import Scales
 from bayesoleo.effects._places import PART
 from bayesoleo.effects._terms import FAMILY as TERMS, terms_of
@@ -261,6 +262,9 @@ class Assembly:
         Conditions and channels that are known to a tolerance only.
     starts : bool
         Whether starts that the model does not declare are estimated: there are transient runs.
+    corner : str
+        Corner of dry friction at zero velocity, of all effects that are in it or may be added: a
+        body has one.
     """
 
     native: Model
@@ -271,6 +275,7 @@ class Assembly:
     declared: Model | None = None
     nuisance: Nuisance = field(default_factory=Nuisance)
     starts: bool = False
+    corner: str = ARCTANGENT
 
     @property
     def added(self) -> tuple[Added, ...]:
@@ -310,11 +315,27 @@ class Assembly:
         An effect acts on what another brought if it sits there, as a parameter that varies by run
         does, or follows it, as a curve follows the memory of a friction law.
         """
+        return self._anew([other for other in self.steps if other is not step], self.corner)
+
+    @property
+    def has_corner(self) -> bool:
+        """Whether dry friction was added whose corner the declared model does not state."""
         declared = self.declared or self.native
-        base = Assembly(declared, self.drive, nuisance=self.nuisance, starts=self.starts)
+        return any(has_corner(step.effect, declared) for step in self.steps)
+
+    def with_corner(self, corner: str) -> Assembly:
+        """The same effects with another corner of dry friction, and the same parameters."""
+        return self._anew(self.steps, corner) if self.steps else replace(self, corner=corner)
+
+    def _anew(self, steps: Sequence[AddedEffect], corner: str) -> Assembly:
+        """Assembled again from some of its effects."""
+        declared = self.declared or self.native
+        base = Assembly(
+            declared, self.drive, nuisance=self.nuisance, starts=self.starts, corner=corner
+        )
         everywhere = _undeclared(self.model())
-        for other in self.steps:
-            if other is step or other.target not in other.effect.places(base._base(other.effect)):
+        for other in steps:
+            if other.target not in other.effect.places(base._base(other.effect)):
                 continue
             option = base.option(other.effect, other.target, other.scales)
             if _undeclared(option.model) <= everywhere:
@@ -331,7 +352,8 @@ class Assembly:
         two that lean on each other follow whatever a third one would explain.
         """
         found, driven = [], self.model()
-        for effect in catalogue() if effects is None else effects:
+        for usual in catalogue() if effects is None else effects:
+            effect = with_corner(usual, self.corner)
             base = driven if effect.on_channels else self.native  # made once for all channels
             for candidate in candidates(base, scales, (effect,)):
                 if candidate.family == TERMS and not self._declares(candidate.target):
@@ -356,6 +378,7 @@ class Assembly:
         ModelError
             If it does not apply there, or leaves no unique inverse for the drive.
         """
+        effect = with_corner(effect, self.corner)
         base = self._base(effect)
         candidate = effect.extend(base, target, scales)
         assembly = self._with_candidate(effect, candidate, scales, base)

@@ -22,6 +22,7 @@ from bayesoleo._parallel import single_blas_thread
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._alternatives import best_of_beam, eliminated
 from bayesoleo.discovery._assembly import Added, Assembly, Roles
+from bayesoleo.discovery._corners import cornered, scored_with
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._fit_and_hold_out_error import RunError, least_noise, limit
 from bayesoleo.discovery._judged_together import TOGETHER, judged_together
@@ -406,10 +407,11 @@ def probabilities(
     known += [(final.assembly, final.fit)] if final.assembly.steps else []
     # The noise is that which the best model has left.
     errors = {(entry.run, entry.output): entry for entry in final.fit_errors.entries}
+    corner = final.assembly.corner
     return structure_posterior(
         first.base(),
-        first.assembly,
-        [item.score for item in ranking],
+        first.assembly.with_corner(corner),
+        scored_with(first, [item.score for item in ranking], corner, numerics.jobs),
         errors,
         numerics,
         prior=prior,
@@ -525,6 +527,7 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
         if outcome.after is not None:
             notes = [note for note in notes if not note.startswith(TOGETHER)]
             state = eliminated(outcome.after, state, roles, numerics, notes, callback)
+            state = cornered(state, roles, numerics, callback)
             noise = least_noise(roles.measured, state.errors.record_noise)
             roles = replace(roles, measured=noise)
         known = known.after(outcome, state, notes)

@@ -6,7 +6,7 @@ the spectrum of the noise.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -23,6 +23,7 @@ from bayesoleo.discovery._samples_that_count import weights
 from bayesoleo.discovery._score_basis import Base, squared_distance
 from bayesoleo.discovery._score_tests import Score, inflation_by_estimate
 from bayesoleo.discovery._transient_variance import RunNoise, coloured_variance
+from bayesoleo.effects._forces import CORNERS, TRANSITION, has_corner
 from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Parameter
@@ -242,7 +243,76 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
     assembly = assembly.with_parameters(new_parameters(assembly, score, base.policy))
     model = assembly.model()
     fit = quick_fit(base, model, _starts(base, score, model), numerics)
-    return refit_at(base, score, assembly, fit)
+    found = refit_at(base, score, assembly, fit)
+    added = assembly.steps[-1].effect
+    if has_corner(added, assembly.declared or assembly.native):
+        return with_better_corner(base, found, numerics)
+    return found
+
+
+def with_better_corner(base: Base, found: Refit, numerics: Numerics) -> Refit:
+    """An estimate with the corner of dry friction that makes the data clearly likelier.
+
+    The arctangent's corner comes with tails: at ten transition velocities a fifteenth of the
+    friction is still to come. The corner of measured friction may end sooner, and effects that
+    nothing has are then found in the difference. Where noise explains what is left, or next to
+    nothing is explained, no other corner is tried.
+
+    Parameters
+    ----------
+    base : Base
+        What it was estimated against.
+    found : Refit
+        Of a model with friction that has a corner.
+    numerics : Numerics
+    """
+    if found.reached or not found.share > base.policy.least_share:
+        return found
+    for assembly, fit in other_corners(base, found.assembly, found.fit, numerics):
+        other = refit_at(base, found.score, assembly, fit)
+        if clearly_better(base, found.fall, other.fall, other.inflation):
+            found = other
+    return found
+
+
+def other_corners(
+    base: Base, assembly: Assembly, fit: ModelFit, numerics: Numerics
+) -> Iterator[tuple[Assembly, ModelFit]]:
+    """A model with each other corner of dry friction, and its estimate from the present one."""
+    present = assembly.model().parameters
+    widths = [name for name in fit.values if present[name].description == TRANSITION]
+    # An arctangent makes up for its tails by a smaller velocity.
+    starts = [
+        fit.values | {name: factor * fit.values[name] for name in widths}
+        for factor in (1.0, 2.0, 4.0, 0.5)
+    ]
+    for corner in CORNERS:
+        if corner != assembly.corner:
+            other = assembly.with_corner(corner)
+            yield other, quick_fit(base, other.model(), starts, numerics)
+
+
+def clearly_better(base: Base, before: float, after: float, inflation: float) -> bool:
+    """Whether a fall of the sum of squares exceeds another one, by as many unknowns, so clearly
+    that another form of the same effect is taken for it.
+
+    The ratio of likelihoods must be that which tells two effects apart, as much larger as what is
+    left exceeds noise. Where more than noise is left, it must also be as large a part of that as a
+    further effect has to explain: the form would else make up for what is missing.
+    """
+    policy, rest = base.policy, replace(base, excess=base.excess - after)
+    if not after - before > policy.equal_likelihood * inflation * dispersion(rest):
+        return False
+    least = policy.fair_share * (max(base.excess - before, 0.0) + base.feigned)
+    return rest.excess < base.feigned or after - before > least
+
+
+def dispersion(base: Base) -> float:
+    """Mean square of the residual of periodic runs over that of the noise, at least one. For
+    transients it is one, because their inflation holds it."""
+    if not base.fit.all_periodic or not base.excess > base.feigned:
+        return 1.0
+    return 1.0 + base.excess / max(base.noise, 1e-300)
 
 
 def refit_at(base: Base, score: Score, assembly: Assembly, fit: ModelFit) -> Refit:

@@ -16,7 +16,7 @@ import numpy as np
 
 from bayesoleo._types import ProgressCallback
 from bayesoleo._worker_processes import process_map
-from bayesoleo.discovery._alternatives import Loss, dispersion, eliminated, loss_without
+from bayesoleo.discovery._alternatives import Loss, eliminated, loss_without
 from bayesoleo.discovery._assembly import AddedEffect, Roles
 from bayesoleo.discovery._fit_difference import undecided
 from bayesoleo.discovery._hold_out_confirmation import (
@@ -36,6 +36,7 @@ from bayesoleo.discovery._ranking import (
 )
 from bayesoleo.discovery._refit import (
     Refit,
+    dispersion,
     fall_from,
     new_parameters,
     quick_fit,

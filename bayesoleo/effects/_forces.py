@@ -52,6 +52,20 @@ from bayesoleo.model._expressions import COSINE, SINE, TIME, parse, symbol, with
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Coordinate, Dof
 
+#: Corners of dry friction at zero velocity.
+ARCTANGENT, HYPERBOLIC = "arctangent", "hyperbolic tangent"
+#: Smooth signs by corner, over the velocity at which they are one half; the first is the usual one.
+_SIGNS: dict[str, Callable[[sp.Expr], sp.Expr]] = {
+    ARCTANGENT: lambda ratio: 2 / sp.pi * sp.atan(ratio),
+    HYPERBOLIC: lambda ratio: sp.tanh(sp.log(3) / 2 * ratio),
+}
+CORNERS = tuple(_SIGNS)
+#: The same as formulas.
+_FORMULAS = {
+    ARCTANGENT: r"\frac{2}{\pi} \arctan(\dot q / v_0)",
+    HYPERBOLIC: r"\tanh(\frac{\ln 3}{2} \dot q / v_0)",
+}
+
 #: A model's own friction slope, in s/m: effects that need a smooth sign use it where it exists.
 FRICTION_SLOPE = "friction_slope"
 
@@ -169,9 +183,12 @@ def single_force(amplitude: Amplitude, family: str, expression: str, **more: Any
 
     Its checks are made by the tests: they would take a sixth of the time in which libraries load.
     """
-    states, requires = more.pop("states", {}), more.pop("requires", ())
-    term = AddedTerm(amplitude.name, expression, tuple(states.items()), requires)
+    states, requires, over = (more.pop(k, d) for k, d in _OF_THE_TERM.items())
+    term = AddedTerm(amplitude.name, expression, tuple(states.items()), requires, over)
     return term.as_effect(family, (amplitude,), **more)
+
+
+_OF_THE_TERM: dict[str, Any] = {"states": {}, "requires": (), "over": ""}
 
 
 def _latex(expression: str, used: set[str], effect: str) -> str:
@@ -202,10 +219,13 @@ _MOTION_CONSTANTS = (
 )
 
 
+#: What is said of the velocity of a corner.
+TRANSITION = "velocity at which friction has half its final size"
+
+
 def transition_velocity(name: str) -> ShapeParameter:
     """The velocity of a smooth sign, to be scanned."""
-    words = "velocity at which friction has half its final size"
-    return ShapeParameter(name, "position/s", "v_0", words, velocity_grid(1 / 512, 1 / 4))
+    return ShapeParameter(name, "position/s", "v_0", TRANSITION, velocity_grid(1 / 512, 1 / 4))
 
 
 #: Velocity over which the sign of a dry friction force changes, where the model states no slope.
@@ -276,16 +296,23 @@ class AddedTerm:
         New dofs by name.
     requires : tuple of str
         Names that a model must declare.
+    over : str
+        The effect's own shape over which ``direction`` changes; by default the smoothing velocity
+        or the model's slope.
+    corner : str
+        One of :data:`CORNERS`: the form of ``direction``.
     """
 
     effect: str
     expression: str
     states: tuple[tuple[str, InternalState], ...] = ()
     requires: tuple[str, ...] = ()
+    over: str = ""
+    corner: str = ARCTANGENT
 
     def used(self) -> set[str]:
         """All names in the force and in the equations of the states."""
-        texts = [self.expression, *(state.equation for _, state in self.states)]
+        texts = [self.expression, *(state.equation for _, state in self.states), self.over or "0"]
         return set[str]().union(*(_names_in(text, self.effect) for text in texts))
 
     def check(
@@ -328,7 +355,7 @@ class AddedTerm:
             amplitudes=amplitudes,
             places=_places_for(used, self.requires),
             change=self,
-            shapes=(*shapes, SMOOTHING) if "direction" in used else shapes,
+            shapes=(*shapes, SMOOTHING) if "direction" in used and not self.over else shapes,
             constants=tuple(item for item in _MOTION_CONSTANTS if item.name in used),
             source=source,
             applies_to=applies_to or _applies_to(used, self.requires),
@@ -339,6 +366,9 @@ class AddedTerm:
         place, effect = place_at(model, target), self.effect
         dofs = {own: free_name(f"{effect}_{own}", model) for own, _ in self.states}
         known = _vocabulary(model, place, names) | {own: symbol(n) for own, n in dofs.items()}
+        if place.velocity is not None and self._has_direction(model, names):
+            over = names.get(self.over or "smoothing")
+            known["direction"] = smooth_sign(model, place.velocity, over, self.corner)
         dynamic = (*model.dofs, *model.inputs, *dofs.values())
         where = f"effect {effect}"
         for own, state in self.states:
@@ -348,6 +378,38 @@ class AddedTerm:
         force = parse(self.expression, known, dynamic, where)
         # An output shows the force itself; in an equation the force has the sign of the inertia.
         return with_force(model, place, _free_term(effect, model, place), force)
+
+    def _has_direction(self, model: Model, names: Names) -> bool:
+        return bool(self.over) or "smoothing" in names or FRICTION_SLOPE in model.parameters
+
+    def has_corner(self, model: Model) -> bool:
+        """Whether it is dry friction whose corner is not that of the model's own friction."""
+        if "direction" not in _names_in(self.expression, self.effect):
+            return False
+        return bool(self.over) or FRICTION_SLOPE not in model.parameters
+
+
+def has_corner(effect: Effect, model: Model) -> bool:
+    """Whether an effect is dry friction whose corner the model does not state."""
+    return isinstance(effect.change, AddedTerm) and effect.change.has_corner(model)
+
+
+def with_corner(effect: Effect, corner: str) -> Effect:
+    """An effect with another corner of dry friction; any other effect as it is.
+
+    The velocity at which friction has half its final size stays the parameter of the corner.
+
+    Parameters
+    ----------
+    effect : Effect
+    corner : str
+        One of :data:`CORNERS`.
+    """
+    term = effect.change
+    if not isinstance(term, AddedTerm) or term.corner == corner:
+        return effect
+    formula = effect.formula.replace(_FORMULAS[term.corner], _FORMULAS[corner])
+    return replace(effect, change=replace(term, corner=corner), formula=formula)
 
 
 def _free_term(name: str, model: Model, place: Coordinate) -> str:
@@ -372,19 +434,21 @@ def _vocabulary(model: Model, place: Coordinate, names: Names) -> dict[str, sp.E
         known["pressure"] = pressure
     if place.velocity is not None:
         known |= {"velocity": place.velocity, "acceleration": place.acceleration}
-        if FRICTION_SLOPE in model.parameters or "smoothing" in names:
-            known["direction"] = smooth_sign(model, place.velocity, names)
     return known | dict(names)
 
 
-def smooth_sign(model: Model, velocity: sp.Expr, names: Names) -> sp.Expr:
-    r"""Sign of a velocity, :math:`\frac{2}{\pi}\arctan(v/v_0)` (Verbeek 1993, eq. 6.1).
+def smooth_sign(
+    model: Model, velocity: sp.Expr, over: sp.Symbol | None, corner: str = ARCTANGENT
+) -> sp.Expr:
+    r"""Sign of a velocity, :math:`\frac{2}{\pi}\arctan(v/v_0)` (Verbeek 1993, eq. 6.1), or with
+    another corner.
 
-    The model's own ``friction_slope`` is :math:`1/v_0` where it declares one.
+    Without a velocity to change over, the model's own ``friction_slope`` is :math:`1/v_0`, and the
+    corner is the arctangent of the model's own friction.
     """
-    if FRICTION_SLOPE in model.parameters:
-        return 2 / sp.pi * sp.atan(symbol(FRICTION_SLOPE) * velocity)
-    return 2 / sp.pi * sp.atan(velocity / names["smoothing"])
+    if over is None:
+        return _SIGNS[ARCTANGENT](symbol(FRICTION_SLOPE) * velocity)
+    return _SIGNS[corner](velocity / over)
 
 
 #: Name under which a model may declare the acceleration of gravity.
