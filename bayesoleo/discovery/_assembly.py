@@ -323,6 +323,11 @@ class Assembly:
         declared = self.declared or self.native
         return any(has_corner(step.effect, declared) for step in self.steps)
 
+    @property
+    def ends_in_corner(self) -> bool:
+        """Whether the last effect is such dry friction."""
+        return bool(self.steps) and replace(self, steps=self.steps[-1:]).has_corner
+
     def with_corner(self, corner: str) -> Assembly:
         """The same effects with another corner of dry friction, and the same parameters."""
         return self._anew(self.steps, corner) if self.steps else replace(self, corner=corner)

@@ -27,14 +27,11 @@ def cornered(state: State, roles: Roles, numerics: Numerics, callback: ProgressC
     callback : callable
         Receives a message at each step.
     """
-    steps = state.assembly.steps
-    if state.at_floor or not steps or not state.assembly.has_corner:
+    # An estimate of friction that was just added has tried the other corners.
+    if state.at_floor or not state.assembly.has_corner or state.assembly.ends_in_corner:
         return state
-    last, declared = steps[-1].effect, state.assembly.declared or state.assembly.native
-    if has_corner(last, declared):
-        return state  # its estimate has just tried the other corners
     base, best = state.base(), 0.0
-    names = [name for step in steps for name in step.amplitudes]
+    names = [name for step in state.assembly.steps for name in step.amplitudes]
     for assembly, fit in other_corners(base, state.assembly, state.fit, numerics):
         share, changes = compare(base, fit)
         noise = inflation_along(base, fit, names, changes)

@@ -39,6 +39,7 @@ from bayesoleo.discovery._structure_search import DEFAULT_PRIOR, structure_poste
 from bayesoleo.discovery._structures import StructurePosterior, StructurePrior
 from bayesoleo.discovery._work import ENDED, ENDS, work_of
 from bayesoleo.effects._effect import Effect
+from bayesoleo.effects._forces import ARCTANGENT
 from bayesoleo.effects._nonparametric import FAMILY
 
 #: Families of effects that name no cause.
@@ -64,6 +65,8 @@ NO_PROBABILITIES = "the probabilities of structures could not be computed"
 ON_LIMIT = "at the limit of their prior's support"
 #: Beginning of the note on a declared model that was estimated from another start than its own.
 OTHER_OPTIMUM = "the estimate from the declared values ended in a local optimum, lower"
+#: Beginning of the note on the corner of dry friction, where it is not the usual one.
+OTHER_CORNER = "the dry friction that was added changes its sign with the velocity as a"
 #: Beginning of the note on parameters whose sign is not the declared one.
 OTHER_SIGN = "opposite in sign to the declared value"
 
@@ -598,6 +601,10 @@ def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
     state = progress.state
     notes = [*progress.notes, *_warnings(state.fit), *_turned(progress.first.fit, state.fit)]
     notes += nonparametric_notes(progress.rounds)
+    if state.assembly.has_corner and state.assembly.corner != ARCTANGENT:
+        notes.append(
+            f"{OTHER_CORNER} {state.assembly.corner} does; with an {ARCTANGENT} more is left"
+        )
     notes += [f"could not be predicted: run {text}" for text in state.unsolved]
     notes += state.too_quiet
     judged = any(note.startswith(TOGETHER) for note in notes)

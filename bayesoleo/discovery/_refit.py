@@ -23,7 +23,7 @@ from bayesoleo.discovery._samples_that_count import weights
 from bayesoleo.discovery._score_basis import Base, squared_distance
 from bayesoleo.discovery._score_tests import Score, inflation_by_estimate
 from bayesoleo.discovery._transient_variance import RunNoise, coloured_variance
-from bayesoleo.effects._forces import CORNERS, TRANSITION, has_corner
+from bayesoleo.effects._forces import CORNERS, TRANSITION
 from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Parameter
@@ -34,6 +34,10 @@ from bayesoleo.prediction._records import Record
 
 #: Parts of the values that a score expects, from which an estimate may start.
 STARTS = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 64, 1 / 256, 1 / 2**12, 1 / 2**16)
+
+#: Factors of the velocity of a corner from which another corner's estimate may start: an arctangent
+#: makes up for its tails by a smaller one.
+WIDER = (0.5, 4.0, 2.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -227,7 +231,7 @@ class Refit:
         return bool(stats.chi2.cdf(distance, len(index)) >= 2 * level - 1)
 
 
-def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
+def refit(base: Base, score: Score, numerics: Numerics, corner: str | None = None) -> Refit:
     """Estimate the model extended by a candidate.
 
     Parameters
@@ -238,16 +242,17 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
         Score, for the starts and the scale of priors.
     numerics : Numerics
         The mesh is the present fit's.
+    corner : str, optional
+        Of dry friction, where it is known; by default another one than the model's may be found.
     """
     assembly = score.option.assembly.with_values(base.fit.shared)
+    if corner not in (None, assembly.corner):
+        assembly = assembly.with_corner(corner)
     assembly = assembly.with_parameters(new_parameters(assembly, score, base.policy))
     model = assembly.model()
     fit = quick_fit(base, model, _starts(base, score, model), numerics)
     found = refit_at(base, score, assembly, fit)
-    added = assembly.steps[-1].effect
-    if has_corner(added, assembly.declared or assembly.native):
-        return with_better_corner(base, found, numerics)
-    return found
+    return found if corner is not None else with_better_corner(base, found, numerics)
 
 
 def with_better_corner(base: Base, found: Refit, numerics: Numerics) -> Refit:
@@ -263,10 +268,10 @@ def with_better_corner(base: Base, found: Refit, numerics: Numerics) -> Refit:
     base : Base
         What it was estimated against.
     found : Refit
-        Of a model with friction that has a corner.
     numerics : Numerics
     """
-    if found.reached or not found.share > base.policy.least_share:
+    explains = not found.reached and found.share > base.policy.least_share
+    if not (explains and found.assembly.ends_in_corner):
         return found
     for assembly, fit in other_corners(base, found.assembly, found.fit, numerics):
         other = refit_at(base, found.score, assembly, fit)
@@ -280,12 +285,8 @@ def other_corners(
 ) -> Iterator[tuple[Assembly, ModelFit]]:
     """A model with each other corner of dry friction, and its estimate from the present one."""
     present = assembly.model().parameters
-    widths = [name for name in fit.values if present[name].description == TRANSITION]
-    # An arctangent makes up for its tails by a smaller velocity.
-    starts = [
-        fit.values | {name: factor * fit.values[name] for name in widths}
-        for factor in (1.0, 2.0, 4.0, 0.5)
-    ]
+    widths = [name for name in fit.shared if present[name].description == TRANSITION]
+    starts = [fit.values | {name: factor * fit.shared[name] for name in widths} for factor in WIDER]
     for corner in CORNERS:
         if corner != assembly.corner:
             other = assembly.with_corner(corner)

@@ -384,7 +384,7 @@ class AddedTerm:
 
     def has_corner(self, model: Model) -> bool:
         """Whether it is dry friction whose corner is not that of the model's own friction."""
-        if "direction" not in _names_in(self.expression, self.effect):
+        if "direction" not in self.used():
             return False
         return bool(self.over) or FRICTION_SLOPE not in model.parameters
 

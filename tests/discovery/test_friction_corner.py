@@ -1,0 +1,195 @@
+"""Dry friction whose corner is not an arctangent is one effect, with another corner."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cloudpickle
+import numpy as np
+import pytest
+from fitted_states import NUMERICS, fitted, options, scored
+from small_campaigns import damper, damper_campaign, oscillator_campaign, spring_damper_force
+from test_velocities import motor, motor_campaign, oscillator
+
+from bayesoleo.discovery import _refit as refits
+from bayesoleo.discovery._assembly import Assembly, assign
+from bayesoleo.discovery._corners import cornered, scored_with
+from bayesoleo.discovery._loop import OTHER_CORNER, Progress, close_loop
+from bayesoleo.discovery._refit import clearly_better, refit
+from bayesoleo.discovery._score_tests import Score
+from bayesoleo.discovery._state import State, fit_state
+from bayesoleo.effects import find_effect
+from bayesoleo.effects._forces import ARCTANGENT, HYPERBOLIC
+
+FRICTION, AT = 5.0, 0.01
+#: A hyperbolic tangent is one half there.
+HALF = np.log(3.0) / 2.0
+
+
+def with_tanh(x, v, t):
+    return spring_damper_force(x, v, t) + FRICTION * np.tanh(v / AT)
+
+
+def with_arctangent(x, v, t):
+    return spring_damper_force(x, v, t) + FRICTION * 2 / np.pi * np.arctan(v / AT)
+
+
+@pytest.fixture(scope="module")
+def sharp(tmp_path_factory) -> State:
+    """A force law without its friction, fitted to friction with the corner of a tangent."""
+    folder = tmp_path_factory.mktemp("sharp")
+    return fitted(damper_campaign(folder, with_tanh, noise=0.02), damper())
+
+
+@pytest.fixture(scope="module")
+def round_(tmp_path_factory) -> State:
+    """The same with the corner of an arctangent."""
+    folder = tmp_path_factory.mktemp("round")
+    return fitted(damper_campaign(folder, with_arctangent, noise=0.02), damper())
+
+
+def score_of(state: State, name: str = "coulomb_friction") -> Score:
+    return scored(state, name)[name]
+
+
+def test_an_estimate_takes_the_corner_that_the_data_have(sharp):
+    usual = refit(sharp.base(), score_of(sharp), NUMERICS, ARCTANGENT)
+    assert not usual.reached
+    found = refit(sharp.base(), score_of(sharp), NUMERICS)
+    assert found.assembly.corner == HYPERBOLIC
+    assert found.reached
+    names, theta, sd = found.fit.problem.names, found.fit.point.theta, found.fit.point.sd
+    for name, true in {
+        "coulomb_friction": FRICTION,
+        "coulomb_friction_transition": HALF * AT,
+    }.items():
+        k = names.index(name)
+        assert abs(theta[k] - true) < 4 * sd[k] < 0.02 * true
+
+
+def test_no_other_corner_is_tried_where_noise_is_left(round_, monkeypatch):
+    tried = []
+    monkeypatch.setattr(refits, "other_corners", lambda *_: iter(tried.append(1) or ()))
+    found = refit(round_.base(), score_of(round_), NUMERICS)
+    assert found.reached
+    assert found.assembly.corner == ARCTANGENT
+    assert not tried
+
+
+def test_nor_where_next_to_nothing_is_explained(sharp, monkeypatch):
+    tried = []
+    monkeypatch.setattr(refits, "other_corners", lambda *_: iter(tried.append(1) or ()))
+    for name, most in {"coulomb_friction": 1.0, "asymmetric_friction": 0.05}.items():
+        tried.clear()
+        found = refit(sharp.base(), score_of(sharp, name), NUMERICS)
+        assert found.share <= most
+        assert bool(tried) == (name == "coulomb_friction")
+
+
+def test_a_corner_must_be_clearly_better(sharp):
+    base = sharp.base()
+    usual = refit(base, score_of(sharp), NUMERICS, ARCTANGENT).fall
+    # Noise is left: the odds alone decide, by which two effects are told apart.
+    enough = base.excess - 0.5 * base.feigned
+    assert not clearly_better(base, enough, enough + 5.9, 1.0)
+    assert clearly_better(base, enough, enough + 6.1, 1.0)
+    assert not clearly_better(base, enough, enough + 6.1, 2.0)
+    # More than noise is left: it must explain an eighth of that as well.
+    left = base.excess - usual
+    assert not clearly_better(base, usual, usual + 0.1 * left, 1.0)
+    assert clearly_better(base, usual, usual + 0.2 * left, 1.0)
+
+
+def test_what_comes_later_has_the_same_corner(sharp):
+    found = refit(sharp.base(), score_of(sharp), NUMERICS).assembly
+    state = replace(sharp, assembly=found)
+    (option,) = options(state, ["stribeck_friction"])
+    assert "tanh" in str(option.model.outputs) or "tanh" in str(option.assembly.native.outputs)
+    scales = found.steps[0].scales
+    again = found.option(find_effect("stribeck_friction"), "force", scales)
+    less = again.assembly.without(again.assembly.steps[0])
+    assert less.corner == HYPERBOLIC
+    assert [effect for effect, _ in less.added] == ["stribeck_friction"]
+    assert "atan" not in str(less.native.output_terms("force"))
+
+
+def test_a_corner_can_be_changed_and_changed_back(sharp):
+    usual = refit(sharp.base(), score_of(sharp), NUMERICS, ARCTANGENT).assembly
+    other = usual.with_corner(HYPERBOLIC)
+    assert other.added == usual.added
+    assert dict(other.model().parameters) == dict(usual.model().parameters)
+    assert other.native.output_terms("force") != usual.native.output_terms("force")
+    back = other.with_corner(ARCTANGENT)
+    assert back.native.output_terms("force") == usual.native.output_terms("force")
+
+
+def added(state: State, name: str) -> State:
+    """The model with one more effect, with the corner that the model has, fitted."""
+    found = refit(state.base(), score_of(state, name), NUMERICS, state.assembly.corner)
+    roles = assign(state.fit.records)
+    return fit_state(found.assembly, roles, NUMERICS, start=found.fit.point.theta)
+
+
+def test_the_corner_is_looked_at_again_when_another_effect_was_added(tmp_path):
+    reduced = damper_campaign(tmp_path, with_tanh, noise=0.02)
+    state = fitted(reduced, damper(cubic=False))
+    roles = assign(state.fit.records)
+    first = added(added(state, "coulomb_friction"), "cubic_stiffness")
+    assert not first.at_floor
+    found = cornered(first, roles, NUMERICS, lambda _: None)
+    assert found.assembly.corner == HYPERBOLIC
+    assert found.at_floor
+    # It is right now.
+    assert cornered(found, roles, NUMERICS, lambda _: None) is found
+
+
+def test_structures_are_scored_with_the_corner_that_was_found(sharp):
+    both = list(scored(sharp, "coulomb_friction", "cubic_stiffness", "quintic_stiffness").values())
+    assert scored_with(sharp, both, ARCTANGENT, 1) is both
+    found = scored_with(sharp, both, HYPERBOLIC, 1)
+    for old, new in zip(both, found, strict=True):
+        assert new.option.key == old.option.key
+        rubs = old.option.key[0] == "coulomb_friction"
+        assert (new is old) != rubs
+        if rubs:
+            assert new.share > old.share
+            assert new.option.assembly.corner == HYPERBOLIC
+
+
+def rubbing(x, v):
+    return 400.0 * x + 0.8 * v + 0.5 * np.tanh(v / 0.01)
+
+
+@pytest.mark.slow
+def test_one_effect_is_found_on_an_oscillator(tmp_path):
+    reduced = oscillator_campaign(tmp_path, restoring=rubbing)
+    kept: list[Progress] = []
+    assembly, roles = Assembly(oscillator(states=False), None), assign(reduced.records)
+    loop = close_loop(assembly, roles, NUMERICS, keep=kept.append)
+    assert loop.effects == ("coulomb_friction",)
+    assert loop.final.assembly.corner == HYPERBOLIC
+    assert any(note.startswith(OTHER_CORNER) for note in loop.notes)
+    assert loop.structures is not None
+    best = loop.structures.structures[0]
+    assert [effect for effect, _ in best.effects] == ["coulomb_friction"]
+    assert not best.outside
+    assert best.probability > 0.9
+    # It is the same where it was stopped after its first round.
+    known = cloudpickle.loads(cloudpickle.dumps(kept[1]))
+    again = close_loop(assembly, roles, NUMERICS, known=known)
+    assert again.effects == loop.effects
+    assert again.final.assembly.corner == HYPERBOLIC
+    assert again.final.fit.point.theta == pytest.approx(loop.final.fit.point.theta, rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("corner", [ARCTANGENT, HYPERBOLIC])
+def test_one_effect_is_found_on_a_motor(tmp_path, monkeypatch, corner):
+    if corner == HYPERBOLIC:
+        monkeypatch.setattr("test_velocities.np.arctan", lambda x: np.pi / 2 * np.tanh(x))
+    monkeypatch.setattr("test_velocities.NOISE", 0.01)
+    reduced = motor_campaign(tmp_path, 0.04)
+    monkeypatch.undo()
+    loop = close_loop(Assembly(motor(), None), assign(reduced.records), NUMERICS)
+    assert loop.effects == ("coulomb_friction",)
+    assert loop.final.assembly.corner == corner
