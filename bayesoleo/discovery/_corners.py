@@ -9,14 +9,23 @@ from __future__ import annotations
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import Roles
 from bayesoleo.discovery._numerics import Numerics
-from bayesoleo.discovery._refit import clearly_better, compare, inflation_along, other_corners
+from bayesoleo.discovery._refit import (
+    clearly_better,
+    compare,
+    first_other,
+    inflation_along,
+    with_other_corner,
+)
 from bayesoleo.discovery._score_tests import Score, score_all
 from bayesoleo.discovery._state import State, fit_state
-from bayesoleo.effects._forces import has_corner
+from bayesoleo.effects._forces import CORNERS, has_corner
 
 
 def cornered(state: State, roles: Roles, numerics: Numerics, callback: ProgressCallback) -> State:
     """The state with the corner of dry friction that makes the data clearly likelier.
+
+    Where more than noise is left, every corner is tried. Where noise is, the tails of an arctangent
+    may still be a part of it that shows in runs which were not fitted, and one other is tried.
 
     Parameters
     ----------
@@ -27,21 +36,27 @@ def cornered(state: State, roles: Roles, numerics: Numerics, callback: ProgressC
     callback : callable
         Receives a message at each step.
     """
-    # An estimate of friction that was just added has tried the other corners.
-    if state.at_floor or not state.assembly.has_corner or state.assembly.ends_in_corner:
+    if not state.assembly.has_corner:
         return state
-    base, best = state.base(), 0.0
+    present = state.assembly.corner
+    others = [first_other(present)]
+    if not state.at_floor:
+        others = [corner for corner in CORNERS if corner != present]
+    base, best, found = state.base(), 0.0, None
     names = [name for step in state.assembly.steps for name in step.amplitudes]
-    for assembly, fit in other_corners(base, state.assembly, state.fit, numerics):
+    callback("test whether friction has another corner")
+    for corner in others:
+        assembly, fit = with_other_corner(base, state.assembly, state.fit, corner, numerics)
         share, changes = compare(base, fit)
         noise = inflation_along(base, fit, names, changes)
         fall = share * base.fall_back
-        if noise is None or not clearly_better(base, best, fall, noise.value):
-            continue
-        callback(f"friction has the corner of the {assembly.corner}")
-        other = fit_state(assembly.with_values(fit.shared), roles, numerics, start=fit.point.theta)
-        state, best = other, fall
-    return state
+        if noise is not None and clearly_better(base, best, fall, noise.value):
+            found, best = (assembly, fit), fall
+    if found is None:
+        return state
+    assembly, fit = found
+    callback(f"take {assembly.corner} for the sign of the velocity in dry friction")
+    return fit_state(assembly.with_values(fit.shared), roles, numerics, start=fit.point.theta)
 
 
 def scored_with(state: State, scores: list[Score], corner: str, jobs: int | None) -> list[Score]:

@@ -66,7 +66,7 @@ ON_LIMIT = "at the limit of their prior's support"
 #: Beginning of the note on a declared model that was estimated from another start than its own.
 OTHER_OPTIMUM = "the estimate from the declared values ended in a local optimum, lower"
 #: Beginning of the note on the corner of dry friction, where it is not the usual one.
-OTHER_CORNER = "the dry friction that was added changes its sign with the velocity as a"
+OTHER_CORNER = "in the dry friction that was added the sign of the velocity v is"
 #: Beginning of the note on parameters whose sign is not the declared one.
 OTHER_SIGN = "opposite in sign to the declared value"
 
@@ -603,7 +603,8 @@ def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
     notes += nonparametric_notes(progress.rounds)
     if state.assembly.has_corner and state.assembly.corner != ARCTANGENT:
         notes.append(
-            f"{OTHER_CORNER} {state.assembly.corner} does; with an {ARCTANGENT} more is left"
+            f"{OTHER_CORNER} {state.assembly.corner}, with half the friction at v0: it leaves"
+            f" less than {ARCTANGENT}"
         )
     notes += [f"could not be predicted: run {text}" for text in state.unsolved]
     notes += state.too_quiet

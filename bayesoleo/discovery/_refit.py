@@ -6,7 +6,7 @@ the spectrum of the noise.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -23,7 +23,7 @@ from bayesoleo.discovery._samples_that_count import weights
 from bayesoleo.discovery._score_basis import Base, squared_distance
 from bayesoleo.discovery._score_tests import Score, inflation_by_estimate
 from bayesoleo.discovery._transient_variance import RunNoise, coloured_variance
-from bayesoleo.effects._forces import CORNERS, TRANSITION
+from bayesoleo.effects._forces import ARCTANGENT, HYPERBOLIC, TRANSITION
 from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Parameter
@@ -261,7 +261,8 @@ def with_better_corner(base: Base, found: Refit, numerics: Numerics) -> Refit:
     The arctangent's corner comes with tails: at ten transition velocities a fifteenth of the
     friction is still to come. The corner of measured friction may end sooner, and effects that
     nothing has are then found in the difference. Where noise explains what is left, or next to
-    nothing is explained, no other corner is tried.
+    nothing is explained, no other corner is tried; else one is, and the rest where the effect was
+    chosen (:func:`~bayesoleo.discovery._corners.cornered`).
 
     Parameters
     ----------
@@ -273,24 +274,27 @@ def with_better_corner(base: Base, found: Refit, numerics: Numerics) -> Refit:
     explains = not found.reached and found.share > base.policy.least_share
     if not (explains and found.assembly.ends_in_corner):
         return found
-    for assembly, fit in other_corners(base, found.assembly, found.fit, numerics):
-        other = refit_at(base, found.score, assembly, fit)
-        if clearly_better(base, found.fall, other.fall, other.inflation):
-            found = other
-    return found
+    corner = first_other(found.assembly.corner)
+    assembly, fit = with_other_corner(base, found.assembly, found.fit, corner, numerics)
+    other = refit_at(base, found.score, assembly, fit)
+    better = clearly_better(base, found.fall, other.fall, other.inflation)
+    return other if better else found
 
 
-def other_corners(
-    base: Base, assembly: Assembly, fit: ModelFit, numerics: Numerics
-) -> Iterator[tuple[Assembly, ModelFit]]:
-    """A model with each other corner of dry friction, and its estimate from the present one."""
+def first_other(corner: str) -> str:
+    """The corner of dry friction that is tried first where a model has another one."""
+    return HYPERBOLIC if corner == ARCTANGENT else ARCTANGENT
+
+
+def with_other_corner(
+    base: Base, assembly: Assembly, fit: ModelFit, corner: str, numerics: Numerics
+) -> tuple[Assembly, ModelFit]:
+    """A model with another corner of dry friction, and its estimate from the present one."""
     present = assembly.model().parameters
     widths = [name for name in fit.shared if present[name].description == TRANSITION]
     starts = [fit.values | {name: factor * fit.shared[name] for name in widths} for factor in WIDER]
-    for corner in CORNERS:
-        if corner != assembly.corner:
-            other = assembly.with_corner(corner)
-            yield other, quick_fit(base, other.model(), starts, numerics)
+    other = assembly.with_corner(corner)
+    return other, quick_fit(base, other.model(), starts, numerics)
 
 
 def clearly_better(base: Base, before: float, after: float, inflation: float) -> bool:

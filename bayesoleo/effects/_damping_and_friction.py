@@ -6,10 +6,9 @@ velocity, and changes of the damping that a model has.
 Friction follows a static law, or a dynamic law with an internal state. The sign of the velocity is
 smooth, :math:`s(\dot q) = \frac{2}{\pi}\arctan(\dot q / v_0)`, as in Verbeek (1993), eq. 6.1: with
 the model's own ``friction_slope`` = :math:`1/v_0` where it declares one, else with a scanned
-:math:`v_0`. Where its tails leave more than noise, a search also tries the corner of a hyperbolic
-tangent. The internal state of a dynamic law follows the sliding surface. It is a number between
-about -1 and 1, so that the amplitude is the sliding friction and the state's equation is regular at
-the null.
+:math:`v_0`. Where its tails leave more than noise, a search also tries other corners. The internal
+state of a dynamic law follows the sliding surface. It is a number between about -1 and 1, so that
+the amplitude is the sliding friction and the state's equation is regular at the null.
 
 References
 ----------

@@ -7,6 +7,7 @@ from dataclasses import replace
 import cloudpickle
 import numpy as np
 import pytest
+import sympy as sp
 from fitted_states import NUMERICS, fitted, options, scored
 from small_campaigns import damper, damper_campaign, oscillator_campaign, spring_damper_force
 from test_velocities import motor, motor_campaign, oscillator
@@ -19,7 +20,14 @@ from bayesoleo.discovery._refit import clearly_better, refit
 from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._state import State, fit_state
 from bayesoleo.effects import find_effect
-from bayesoleo.effects._forces import ARCTANGENT, HYPERBOLIC
+from bayesoleo.effects._forces import (
+    ALGEBRAIC,
+    ARCTANGENT,
+    HYPERBOLIC,
+    SATURATION,
+    smooth_sign,
+)
+from bayesoleo.model._expressions import symbol
 
 FRICTION, AT = 5.0, 0.01
 #: A hyperbolic tangent is one half there.
@@ -48,6 +56,10 @@ def round_(tmp_path_factory) -> State:
     return fitted(damper_campaign(folder, with_arctangent, noise=0.02), damper())
 
 
+def silent(_: str) -> None:
+    """Receives messages."""
+
+
 def score_of(state: State, name: str = "coulomb_friction") -> Score:
     return scored(state, name)[name]
 
@@ -67,9 +79,20 @@ def test_an_estimate_takes_the_corner_that_the_data_have(sharp):
         assert abs(theta[k] - true) < 4 * sd[k] < 0.02 * true
 
 
+def counted(monkeypatch) -> list[str]:
+    """Corners that are tried from now on."""
+    tried, actual = [], refits.with_other_corner
+
+    def counting(base, assembly, fit, corner, numerics):
+        tried.append(corner)
+        return actual(base, assembly, fit, corner, numerics)
+
+    monkeypatch.setattr(refits, "with_other_corner", counting)
+    return tried
+
+
 def test_no_other_corner_is_tried_where_noise_is_left(round_, monkeypatch):
-    tried = []
-    monkeypatch.setattr(refits, "other_corners", lambda *_: iter(tried.append(1) or ()))
+    tried = counted(monkeypatch)
     found = refit(round_.base(), score_of(round_), NUMERICS)
     assert found.reached
     assert found.assembly.corner == ARCTANGENT
@@ -77,13 +100,12 @@ def test_no_other_corner_is_tried_where_noise_is_left(round_, monkeypatch):
 
 
 def test_nor_where_next_to_nothing_is_explained(sharp, monkeypatch):
-    tried = []
-    monkeypatch.setattr(refits, "other_corners", lambda *_: iter(tried.append(1) or ()))
+    tried = counted(monkeypatch)
     for name, most in {"coulomb_friction": 1.0, "asymmetric_friction": 0.05}.items():
         tried.clear()
         found = refit(sharp.base(), score_of(sharp, name), NUMERICS)
         assert found.share <= most
-        assert bool(tried) == (name == "coulomb_friction")
+        assert tried == ([HYPERBOLIC] if name == "coulomb_friction" else [])
 
 
 def test_a_corner_must_be_clearly_better(sharp):
@@ -123,6 +145,23 @@ def test_a_corner_can_be_changed_and_changed_back(sharp):
     assert back.native.output_terms("force") == usual.native.output_terms("force")
 
 
+@pytest.mark.parametrize("corner", [ARCTANGENT, ALGEBRAIC, SATURATION])
+def test_every_corner_is_tried_where_the_effect_was_chosen(tmp_path, corner):
+    """What an estimate does not try is found once its effect is in the model."""
+    v, over = symbol("v"), symbol("over")
+    sign = sp.lambdify((v, over), smooth_sign(damper(), v, over, corner))
+
+    def force(x, v, t):
+        return spring_damper_force(x, v, t) + FRICTION * sign(v, AT)
+
+    state = fitted(damper_campaign(tmp_path, force, noise=0.02), damper())
+    found = cornered(added(state, "coulomb_friction"), assign(state.fit.records), NUMERICS, silent)
+    assert found.assembly.corner == corner
+    assert found.at_floor
+    k = found.fit.problem.names.index("coulomb_friction_transition")
+    assert abs(found.fit.point.theta[k] - AT) < 4 * found.fit.point.sd[k] < 0.02 * AT
+
+
 def added(state: State, name: str) -> State:
     """The model with one more effect, with the corner that the model has, fitted."""
     found = refit(state.base(), score_of(state, name), NUMERICS, state.assembly.corner)
@@ -136,11 +175,11 @@ def test_the_corner_is_looked_at_again_when_another_effect_was_added(tmp_path):
     roles = assign(state.fit.records)
     first = added(added(state, "coulomb_friction"), "cubic_stiffness")
     assert not first.at_floor
-    found = cornered(first, roles, NUMERICS, lambda _: None)
+    found = cornered(first, roles, NUMERICS, silent)
     assert found.assembly.corner == HYPERBOLIC
     assert found.at_floor
     # It is right now.
-    assert cornered(found, roles, NUMERICS, lambda _: None) is found
+    assert cornered(found, roles, NUMERICS, silent) is found
 
 
 def test_structures_are_scored_with_the_corner_that_was_found(sharp):

@@ -40,13 +40,14 @@ def term(effect: Effect, corner: str, model: Model | None = None) -> sp.Expr:
 
 @pytest.mark.parametrize("corner", CORNERS)
 def test_a_corner_is_a_sign_that_is_one_half_at_its_velocity(corner):
-    v, over = sp.symbols("v over", positive=True)
+    v, over = symbol("v"), symbol("over")
     sign = sp.lambdify((v, over), smooth_sign(system("linear_oscillator"), v, over, corner))
     assert sign(0.02, 0.02) == pytest.approx(0.5, abs=1e-12)
     assert sign(-0.02, 0.02) == pytest.approx(-0.5, abs=1e-12)
     # An arctangent is a part of 2/(1000 pi) below one there.
     assert sign(20.0, 0.02) == pytest.approx(1.0, abs=1e-3)
-    assert np.all(np.diff(sign(np.linspace(-0.1, 0.1, 41), 0.02)) > 0)
+    # But for round-off where it is level.
+    assert np.all(np.diff(sign(np.linspace(-0.1, 0.1, 41), 0.02)) > -1e-12)
 
 
 @pytest.mark.parametrize("name", RUBBING)
