@@ -186,6 +186,7 @@ def test_an_effect_on_trial_is_taken_back_where_no_other_one_is_confirmed(monkey
 
     monkeypatch.setattr(loop, "examine", examine)
     monkeypatch.setattr(loop, "eliminated", lambda after, *_: after)
+    monkeypatch.setattr(loop, "cornered", lambda after, *_: after)
     monkeypatch.setattr(loop, "least_noise", lambda *_: None)
     monkeypatch.setattr(loop, "_with_noise", lambda roles, _: roles)
     monkeypatch.setattr(loop, "_ratios", lambda _: "")
@@ -225,6 +226,7 @@ def test_what_is_not_confirmed_beside_the_others_goes_and_is_not_sought_again(mo
 
     monkeypatch.setattr(loop, "examine", examine)
     monkeypatch.setattr(loop, "eliminated", lambda after, *_: after)
+    monkeypatch.setattr(loop, "cornered", lambda after, *_: after)
     monkeypatch.setattr(loop, "least_noise", lambda *_: None)
     monkeypatch.setattr(loop, "_with_noise", lambda roles, _: roles)
     monkeypatch.setattr(loop, "_ratios", lambda _: "")
