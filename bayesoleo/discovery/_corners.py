@@ -12,13 +12,13 @@ from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._refit import (
     clearly_better,
     compare,
-    first_other,
     inflation_along,
+    other_corners,
     with_other_corner,
 )
 from bayesoleo.discovery._score_tests import Score, score_all
 from bayesoleo.discovery._state import State, fit_state
-from bayesoleo.effects._forces import CORNERS, has_corner
+from bayesoleo.effects._forces import has_corner
 
 
 def cornered(state: State, roles: Roles, numerics: Numerics, callback: ProgressCallback) -> State:
@@ -38,10 +38,7 @@ def cornered(state: State, roles: Roles, numerics: Numerics, callback: ProgressC
     """
     if not state.assembly.has_corner:
         return state
-    present = state.assembly.corner
-    others = [first_other(present)]
-    if not state.at_floor:
-        others = [corner for corner in CORNERS if corner != present]
+    others = other_corners(state.assembly.corner)[: 1 if state.at_floor else None]
     base, best, found = state.base(), 0.0, None
     names = [name for step in state.assembly.steps for name in step.amplitudes]
     callback("test whether friction has another corner")

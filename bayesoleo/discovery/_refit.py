@@ -23,7 +23,7 @@ from bayesoleo.discovery._samples_that_count import weights
 from bayesoleo.discovery._score_basis import Base, squared_distance
 from bayesoleo.discovery._score_tests import Score, inflation_by_estimate
 from bayesoleo.discovery._transient_variance import RunNoise, coloured_variance
-from bayesoleo.effects._forces import ARCTANGENT, HYPERBOLIC, TRANSITION
+from bayesoleo.effects._forces import CORNERS, TRANSITION
 from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Parameter
@@ -261,8 +261,8 @@ def with_better_corner(base: Base, found: Refit, numerics: Numerics) -> Refit:
     The arctangent's corner comes with tails: at ten transition velocities a fifteenth of the
     friction is still to come. The corner of measured friction may end sooner, and effects that
     nothing has are then found in the difference. Where noise explains what is left, or next to
-    nothing is explained, no other corner is tried; else one is, and the rest where the effect was
-    chosen (:func:`~bayesoleo.discovery._corners.cornered`).
+    nothing is explained, no other corner is tried. More than one is where the effect explains most
+    of the excess: what is left may then be due to its corner.
 
     Parameters
     ----------
@@ -271,19 +271,23 @@ def with_better_corner(base: Base, found: Refit, numerics: Numerics) -> Refit:
     found : Refit
     numerics : Numerics
     """
-    explains = not found.reached and found.share > base.policy.least_share
-    if not (explains and found.assembly.ends_in_corner):
+    if not found.assembly.ends_in_corner:
         return found
-    corner = first_other(found.assembly.corner)
-    assembly, fit = with_other_corner(base, found.assembly, found.fit, corner, numerics)
-    other = refit_at(base, found.score, assembly, fit)
-    better = clearly_better(base, found.fall, other.fall, other.inflation)
-    return other if better else found
+    best, least = found, base.policy.least_share
+    for corner in other_corners(found.assembly.corner):
+        if best.reached or not best.share > least:
+            break
+        assembly, fit = with_other_corner(base, found.assembly, found.fit, corner, numerics)
+        other = refit_at(base, found.score, assembly, fit)
+        if clearly_better(base, best.fall, other.fall, other.inflation):
+            best = other
+        least = base.policy.explained
+    return best
 
 
-def first_other(corner: str) -> str:
-    """The corner of dry friction that is tried first where a model has another one."""
-    return HYPERBOLIC if corner == ARCTANGENT else ARCTANGENT
+def other_corners(corner: str) -> list[str]:
+    """Corners of dry friction that are tried where a model has another one, in this order."""
+    return [other for other in CORNERS if other != corner]
 
 
 def with_other_corner(

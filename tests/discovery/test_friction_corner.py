@@ -145,21 +145,37 @@ def test_a_corner_can_be_changed_and_changed_back(sharp):
     assert back.native.output_terms("force") == usual.native.output_terms("force")
 
 
+@pytest.mark.parametrize("corner", [ALGEBRAIC, SATURATION])
+def test_every_corner_is_tried_where_most_is_explained(tmp_path, monkeypatch, corner):
+    state = fitted(damper_campaign(tmp_path, rubbing_with(corner), noise=0.02), damper())
+    tried = counted(monkeypatch)
+    found = refit(state.base(), score_of(state), NUMERICS)
+    assert found.assembly.corner == corner
+    assert found.reached
+    assert tried == [HYPERBOLIC, ALGEBRAIC, SATURATION][: 2 if corner == ALGEBRAIC else 3]
+    # One where what is left may be another effect.
+    tried.clear()
+    base = replace(state.base(), policy=replace(NUMERICS.policy, explained=1.1))
+    refit(base, score_of(state), NUMERICS)
+    assert tried == [HYPERBOLIC]
+
+
 @pytest.mark.parametrize("corner", [ARCTANGENT, ALGEBRAIC, SATURATION])
 def test_every_corner_is_tried_where_the_effect_was_chosen(tmp_path, corner):
     """What an estimate does not try is found once its effect is in the model."""
-    v, over = symbol("v"), symbol("over")
-    sign = sp.lambdify((v, over), smooth_sign(damper(), v, over, corner))
-
-    def force(x, v, t):
-        return spring_damper_force(x, v, t) + FRICTION * sign(v, AT)
-
-    state = fitted(damper_campaign(tmp_path, force, noise=0.02), damper())
+    state = fitted(damper_campaign(tmp_path, rubbing_with(corner), noise=0.02), damper())
     found = cornered(added(state, "coulomb_friction"), assign(state.fit.records), NUMERICS, silent)
     assert found.assembly.corner == corner
     assert found.at_floor
     k = found.fit.problem.names.index("coulomb_friction_transition")
     assert abs(found.fit.point.theta[k] - AT) < 4 * found.fit.point.sd[k] < 0.02 * AT
+
+
+def rubbing_with(corner: str):
+    """The force law with friction that has a corner."""
+    v, over = symbol("v"), symbol("over")
+    sign = sp.lambdify((v, over), smooth_sign(damper(), v, over, corner))
+    return lambda x, v, t: spring_damper_force(x, v, t) + FRICTION * sign(v, AT)
 
 
 def added(state: State, name: str) -> State:
