@@ -6,6 +6,8 @@ model then. Those that come later may change which one that is.
 
 from __future__ import annotations
 
+import numpy as np
+
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import Roles
 from bayesoleo.discovery._numerics import Numerics
@@ -52,8 +54,11 @@ def cornered(state: State, roles: Roles, numerics: Numerics, callback: ProgressC
     if found is None:
         return state
     assembly, fit = found
+    other = fit_state(assembly.with_values(fit.shared), roles, numerics, start=fit.point.theta)
+    if np.isnan(other.worst_ratio) or (state.at_floor and not other.at_floor):
+        return state  # runs that were not fitted speak against it
     callback(f"take {assembly.corner} for the sign of the velocity in dry friction")
-    return fit_state(assembly.with_values(fit.shared), roles, numerics, start=fit.point.theta)
+    return other
 
 
 def scored_with(state: State, scores: list[Score], corner: str, jobs: int | None) -> list[Score]:

@@ -603,7 +603,7 @@ def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
     notes += nonparametric_notes(progress.rounds)
     if state.assembly.has_corner and state.assembly.corner != ARCTANGENT:
         notes.append(
-            f"{OTHER_CORNER} {state.assembly.corner}, with half the friction at v0: it leaves"
+            f"{OTHER_CORNER} {state.assembly.corner}, with half the friction at v0: it left"
             f" less than {ARCTANGENT}"
         )
     notes += [f"could not be predicted: run {text}" for text in state.unsolved]

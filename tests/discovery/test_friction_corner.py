@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cloudpickle
 import numpy as np
@@ -12,7 +13,7 @@ from fitted_states import NUMERICS, fitted, options, scored
 from small_campaigns import damper, damper_campaign, oscillator_campaign, spring_damper_force
 from test_velocities import motor, motor_campaign, oscillator
 
-from bayesoleo.discovery import _refit as refits
+from bayesoleo.discovery import _corners as corners, _refit as refits
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._corners import cornered, scored_with
 from bayesoleo.discovery._loop import OTHER_CORNER, Progress, close_loop
@@ -169,6 +170,18 @@ def test_every_corner_is_tried_where_the_effect_was_chosen(tmp_path, corner):
     assert found.at_floor
     k = found.fit.problem.names.index("coulomb_friction_transition")
     assert abs(found.fit.point.theta[k] - AT) < 4 * found.fit.point.sd[k] < 0.02 * AT
+
+
+def test_no_corner_is_taken_that_other_runs_contradict(tmp_path, monkeypatch):
+    """Nor one with which a run has no solution."""
+    state = fitted(damper_campaign(tmp_path, with_tanh, noise=0.02), damper())
+    roles, first = assign(state.fit.records), added(state, "coulomb_friction")
+    calm = SimpleNamespace(assembly=first.assembly, fit=first.fit, base=first.base, at_floor=True)
+    for ratio, floor, taken in ((1.0, True, True), (2.0, False, False), (np.nan, True, False)):
+        other = SimpleNamespace(worst_ratio=ratio, at_floor=floor)
+        monkeypatch.setattr(corners, "fit_state", lambda *_, other=other, **__: other)
+        found = cornered(calm, roles, NUMERICS, silent)
+        assert found is (other if taken else calm)
 
 
 def rubbing_with(corner: str):
