@@ -20,7 +20,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bayesoleo._compiled import jit
+from bayesoleo._compiled import inner, jit
 from bayesoleo._types import Array, Integers
 
 #: Standard deviations beyond which the other side of zero has less than 1e-15 of a normal density.
@@ -79,17 +79,20 @@ def log_moments(
 def _over(counts: Integers, sides: Array, mean: Array, covariance: Array, found: Array) -> None:
     """Of many means ``(m, n)`` and covariances ``(m, m, n)``."""
     size, moments = len(mean), np.empty((len(counts), 3))
-    one, spread = np.empty(size), np.empty((size, size))
+    one, spread, likely = np.empty(size), np.empty((size, size)), np.empty(len(sides))
     for k in range(len(found)):
+        # Copied: a column of an array is another type to compile for.
+        for effect in range(len(sides)):
+            likely[effect] = sides[effect, k]
         for i in range(size):
             one[i] = mean[i, k]
             for j in range(size):
                 spread[i, j] = covariance[i, j, k]
         found[k] = math.log(_squares(counts, one, spread, moments))
-        found[k] += _log_sides(counts, sides[:, k], one, spread, moments)
+        found[k] += _log_sides(counts, likely, one, spread, moments)
 
 
-@jit
+@inner
 def _squares(counts: Integers, mean: Array, covariance: Array, moments: Array) -> float:
     """Product of effects' mean squares, which go to the first column of ``moments``: the moment,
     were there no likely sides and no correlations of effects. Variances are all that it takes of
@@ -105,7 +108,7 @@ def _squares(counts: Integers, mean: Array, covariance: Array, moments: Array) -
     return product
 
 
-@jit
+@inner
 def _log_sides(
     counts: Integers, sides: Array, mean: Array, covariance: Array, moments: Array
 ) -> float:
@@ -118,7 +121,8 @@ def _log_sides(
             if len(counts) > 1:
                 moments[k, 1], moments[k, 2] = _higher_moments(sides[k], distance)
         start += counts[k]
-    product, first = 1.0, 0
+    # A zero that is no constant: for one, all that takes it would be compiled once more.
+    product, first = 1.0, int(counts[0]) - int(counts[0])
     for i in range(len(counts)):
         second = first + counts[i]
         for j in range(i + 1, len(counts)):
@@ -142,7 +146,7 @@ def _log_sides(
     return math.log(product) + sided
 
 
-@jit
+@inner
 def _between(
     first: int, count: int, second: int, number: int, mean: Array, covariance: Array
 ) -> float:
@@ -154,7 +158,7 @@ def _between(
     return 2.0 * total / (count * number)
 
 
-@jit
+@inner
 def _square_given(
     moments: Array, place: int, start: int, count: int, mean: Array, covariance: Array
 ) -> float:
@@ -175,7 +179,7 @@ def _square_given(
     return total / count
 
 
-@jit
+@inner
 def _log_second(positive: float, distance: float) -> float:
     """Logarithm of the mean of ``u^2`` of a normal ``u`` with unit variance, whose sides of zero
     have different weights, by its mean."""
@@ -203,7 +207,7 @@ def _log_second(positive: float, distance: float) -> float:
     return top + math.log(math.exp(here - top) + math.exp(beyond - top))
 
 
-@jit
+@inner
 def _higher_moments(positive: float, distance: float) -> tuple[float, float]:
     """Means of ``u^3`` and ``u^4`` over that of ``u^2``, of the same ``u``."""
     square = distance**2
@@ -221,7 +225,7 @@ def _higher_moments(positive: float, distance: float) -> tuple[float, float]:
     )
 
 
-@jit
+@inner
 def _half_moments(distance: float) -> tuple[float, float, float]:
     """Means of ``u^2``, ``u^3`` and ``u^4`` over ``u > 0``, divided by the normal density at the
     distance of its mean from zero."""
@@ -247,7 +251,7 @@ def _scaled_tail(x: float) -> float:
     return 1.0 / (math.sqrt(math.pi) * value)
 
 
-@jit
+@inner
 def _joined(
     own: Array,
     spread: Array,
@@ -285,7 +289,7 @@ def _joined(
         whole[i, i] = value
 
 
-@jit
+@inner
 def _complete(spread: Array, gain: Array, whole: Array) -> None:
     """Covariances that :func:`_joined` leaves."""
     before, more = gain.shape
@@ -299,7 +303,7 @@ def _complete(spread: Array, gain: Array, whole: Array) -> None:
             whole[i, j] = value
 
 
-@jit
+@inner
 def _student(square: float, log_det: float, count: float, freedom: float) -> float:
     """Log density but for a constant, as :class:`Likelihood` has it."""
     return -0.5 * log_det - 0.5 * (freedom + count) * math.log1p(max(square, 0.0) / freedom)
@@ -378,7 +382,7 @@ def singles(
                     top[label] = max(top[label], found[p, s, t])
 
 
-@jit
+@inner
 def _rough_single(
     data: tuple[float, float, float, float, float, float],
     power: float,

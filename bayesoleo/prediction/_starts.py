@@ -27,7 +27,7 @@ from typing import cast
 import numpy as np
 import sympy as sp
 
-from bayesoleo._compiled import jit
+from bayesoleo._compiled import inner, jit
 from bayesoleo._types import Array, Flags, Float, Int, Integers
 from bayesoleo.errors import ModelError
 from bayesoleo.model._derivatives import Derived
@@ -48,7 +48,7 @@ from bayesoleo.solvers._elimination import eliminate
 from bayesoleo.solvers._orbit import Status, floquet_multipliers
 from bayesoleo.solvers._periodic import Boundary, Solution, solve_periodic
 from bayesoleo.solvers._periodic_newton import Extrapolation
-from bayesoleo.solvers._radau_step import Workspace, evaluate_kernel, inner, workspace
+from bayesoleo.solvers._radau_step import Workspace, evaluate_kernel, workspace
 from bayesoleo.solvers._shooting import solve_shooting
 
 #: Known motion of a dof: its values and derivatives, shape (rows, N), at phases in cycles.

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import carray
 
-from bayesoleo._compiled import BLOCK as POINTS, jit, pointer
+from bayesoleo._compiled import BLOCK as POINTS, inner, jit, pointer
 from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.errors import InputError
 from bayesoleo.solvers import _elimination as sparse, _unrolled_program as unrolled
@@ -69,7 +69,7 @@ def sample(
                 state += orders[j]
 
 
-@jit
+@inner
 def sample_block(
     x: Array, lane: int, block: int, first: Integers, position: Array, w0: Array, w1: Array,
     w2: Array, h: float, orders: Integers, needed: Flags, near: Array, z: Array,
@@ -160,7 +160,7 @@ def rows(
             state += orders[j]
 
 
-@jit
+@inner
 def _integrals(
     own: Array, h: Array, first: Array, second: Array, once: Array, twice: Array
 ) -> None:
@@ -215,7 +215,7 @@ def linear(
             _recover(stages, states, dx[lane])
 
 
-@jit
+@inner
 def _assemble(
     gz: Array, right: Array, first: int, count: int, h: Array, a: Array, aa: Array, c: Array,
     orders: Integers, work: Array,
@@ -262,7 +262,7 @@ def _assemble(
                     work[line, size + D + column, t] = -right[e, column, begin + t * s]
 
 
-@jit
+@inner
 def _transfer(
     stages: Array, h: Array, b: Array, ba: Array, orders: Integers, transfer: Array
 ) -> None:
@@ -289,7 +289,7 @@ def _transfer(
         state += orders[j]
 
 
-@jit
+@inner
 def _add_jumps(
     x: Array, h: Array, b: Array, ba: Array, orders: Integers, initial: bool, transfer: Array
 ) -> None:
@@ -317,7 +317,7 @@ def _add_jumps(
         state += orders[j]
 
 
-@jit
+@inner
 def _add_to_last(source: Array, target: Array) -> None:
     """Add to the last columns, without slices: see ``_elimination._copy_columns``."""
     first = target.shape[1] - source.shape[1]
@@ -327,7 +327,7 @@ def _add_to_last(source: Array, target: Array) -> None:
                 target[i, first + j, m] += source[i, j, m]
 
 
-@jit
+@inner
 def _recover(stages: Array, states: Array, dx: Array) -> None:
     """Stage unknowns from the node states: ``dx (n, w, k)``."""
     D, k, n = states.shape

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from bayesoleo._compiled import jit
+from bayesoleo._compiled import inner, jit
 from bayesoleo._types import Array
 from bayesoleo.solvers._mesh import Tableau
 
@@ -44,7 +44,7 @@ Stencil = dict[int, float]
 SMALLEST_PIVOT = 1e-13
 
 
-@jit
+@inner
 def eliminate(matrix: Array, right: Array, least: float) -> bool:
     """Solve ``matrix @ x = right`` in place by elimination with row scaling and partial pivoting.
 
@@ -94,7 +94,7 @@ def eliminate(matrix: Array, right: Array, least: float) -> bool:
     return True
 
 
-@jit
+@inner
 def eliminate_together(work: Array, scale: Array, count: int, m: int) -> bool:
     """Solve ``count`` systems at once, without exchanging rows: ``work (m, m + k, block)`` holds
     ``[matrix | right]``, systems last.
@@ -133,7 +133,7 @@ def eliminate_together(work: Array, scale: Array, count: int, m: int) -> bool:
     return True
 
 
-@jit
+@inner
 def eliminate_each(work: Array, count: int, m: int) -> bool:
     """The same system by system, with exchange of rows; returns False where one is singular."""
     width = work.shape[1]
@@ -182,7 +182,7 @@ def balance(matrix: Array, size: int, scale: Array) -> None:
                         matrix[k, i] *= factor
 
 
-@jit
+@inner
 def close(product: Array, right: Array, closure: Array) -> tuple[bool, float]:
     """Solve ``(I - product) x = right`` in place, ``product (D, >= D)``, ``right (D, k)``.
 
@@ -201,7 +201,7 @@ def close(product: Array, right: Array, closure: Array) -> tuple[bool, float]:
     return eliminate(closure, right, ROUND_OFF), growth
 
 
-@jit
+@inner
 def close_balanced(
     product: Array, right: Array, closure: Array, scale: Array
 ) -> tuple[bool, float]:
@@ -218,7 +218,7 @@ def close_balanced(
     return regular, growth
 
 
-@jit
+@inner
 def _copy_columns(source: Array, first: int, target: Array) -> None:
     """Copy columns from the first on: an assignment of slices compiles the text of its error too,
     which takes as long as all else in this file."""
@@ -227,7 +227,7 @@ def _copy_columns(source: Array, first: int, target: Array) -> None:
             target[i, j] = source[i, first + j]
 
 
-@jit
+@inner
 def close_and_sweep(transfer: Array, monodromy: Array, states: Array, initial: bool) -> bool:
     """Close the period and run through it once more.
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesoleo._compiled import jit
+from bayesoleo._compiled import inner, jit
 from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.solvers._elimination import eliminate
 from bayesoleo.solvers._radau_step import (
@@ -25,7 +25,6 @@ from bayesoleo.solvers._radau_step import (
     differentiate_step,
     end_of_step,
     evaluate_kernel,
-    inner,
     local_error,
     solve_stages,
     stretch,

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesoleo._compiled import BLOCK, jit
+from bayesoleo._compiled import BLOCK, inner, jit
 from bayesoleo._types import Array, Flags, Float, Integers
 from bayesoleo.solvers._blocked_collocation import columns_of
 from bayesoleo.solvers._unrolled_collocation import REACH, WIDTH
@@ -38,7 +38,7 @@ LINE = 8
 _kept = threading.local()
 
 
-@jit
+@inner
 def total(row: Array) -> float:
     """Sum in eight interleaved partial sums: in fixed order, without waiting for each addition."""
     a = b = c = d = e = f = g = h = 0.0
@@ -87,7 +87,7 @@ def positive(a: Array, lanes: Integers, inside: Flags, defined: Flags) -> None:
         defined[lane] = odd == 0
 
 
-@jit
+@inner
 def unit(motion: float, level: float, change: float) -> float:
     """The scale of changes of a state: its motion about a level, not the level itself.
 

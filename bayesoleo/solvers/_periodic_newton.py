@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numba import carray
 
-from bayesoleo._compiled import BLOCK, after, call_kernel, caller, inlined, jit, pointer
+from bayesoleo._compiled import BLOCK, after, call_kernel, caller, inlined, inner, jit, pointer
 from bayesoleo._types import Array, Integers
 from bayesoleo.solvers._elimination import LARGEST_GROWTH, close as solve_closure, close_balanced
 from bayesoleo.solvers._orbit import Status
@@ -81,7 +81,7 @@ def keep(source: Array, target: Array) -> None:
     _copy(pointer(source, 0), pointer(target, 0), source.size)
 
 
-@jit
+@inner
 def _copy(source: Any, target: Any, count: int) -> None:
     """Copy numbers. Cutting rows out of arrays instead would cost more than copying them: arrays
     count references; and indices that may be negative allow no vector instructions."""
@@ -172,7 +172,7 @@ def evaluate_again(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work)
     return outside == 0 and odd == 0
 
 
-@jit
+@inner
 def _outside(a: Any, sizes: Sizes, count: int) -> tuple[int, int]:
     """At how many points a condition is broken, and at how many it is not a number."""
     outside, odd = 0, 0
@@ -185,7 +185,7 @@ def _outside(a: Any, sizes: Sizes, count: int) -> tuple[int, int]:
     return outside, odd
 
 
-@jit
+@inner
 def _silence(sizes: Sizes, lengths: Integers, b: int, count: int, z: Array, out: Array) -> None:
     """Keep points that repeat a step out of the measures: beyond the end, behind short chunks.
 
@@ -220,7 +220,7 @@ def close(pieces: SweepKernels, sizes: Sizes, work: Work) -> int:
     return CONVERGED if regular else SINGULAR
 
 
-@jit
+@inner
 def _set_identity(matrix: Array) -> None:
     for i in range(matrix.shape[0]):
         for k in range(matrix.shape[1]):
@@ -235,7 +235,7 @@ def start_chunks(pieces: SweepKernels, sizes: Sizes, work: Work, initial: bool) 
     _call_begin(pieces.begin, (history, inverse, start, whole, rest, 0 if initial else 1))
 
 
-@jit
+@inner
 def update(update: int, sizes: Sizes, sweep: Sweep, work: Work) -> None:
     """The Newton step block by block, and at positions that repeat a step."""
     steps, dx = sizes.block, work.dx
@@ -276,7 +276,7 @@ def solve_lanes(
             _in_order(sizes, sweep, now, pointer(x, lane * sizes.steps * sizes.unknowns))
 
 
-@jit
+@inner
 def _in_order(sizes: Sizes, sweep: Sweep, now: Array, x: Any) -> None:
     """Copy a solution, step by step and unknown by unknown."""
     unknowns, row = sizes.unknowns, now.shape[1]
@@ -291,7 +291,7 @@ def _in_order(sizes: Sizes, sweep: Sweep, now: Array, x: Any) -> None:
                 at += WIDTH
 
 
-@jit
+@inner
 def _extrapolate(line: LinearStart, lane: int, now: Array) -> None:
     """``now = base + slopes change``, two slopes at a time."""
     size, count = now.size, line.change.shape[1]
@@ -449,7 +449,7 @@ def _size(x: Array, dx: Array, begin: int, measured: int, scratch: Array) -> tup
     return size, least
 
 
-@jit
+@inner
 def _largest(values: Any, count: int, level: float, scratch: Array) -> float:
     """Largest distance from a level, not a number where one is not.
 

@@ -4,36 +4,28 @@ As in ``_collocation.py`` a step's unknowns are the highest derivatives ``top (s
 stages, and the other quantities are linear in them; here steps follow one another, each with its
 own length. The last stage is the end of the step, so that a step's end is among its unknowns.
 
-Functions that only compiled code calls are compiled without wrappers for Python and for C, and take
-the address of each kernel instead of a function. This cuts compilation to a fraction of the time,
-because each of them takes many arrays.
+Functions that only compiled code calls are compiled without wrappers, and take the address of each
+kernel instead of a function. This cuts compilation to a fraction of the time, because each of them
+takes many arrays.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from bayesoleo._compiled import BLOCK, cached, call_kernel, pointer
+from bayesoleo._compiled import BLOCK, call_kernel, inner, pointer
 from bayesoleo._types import Array, Integers
 from bayesoleo.solvers._elimination import eliminate
 from bayesoleo.solvers._mesh import tableau
 
-#: Options that Numba has and its annotations lack.
-_NO_WRAPPERS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 #: Outcomes of the stages' iteration.
 SOLVED, DIVERGED, SINGULAR, UNDEFINED = 0, 1, 2, 3
 MAXIMUM_ITERATIONS = 8
 #: Changes of stages over the sizes of the states that round-off can make.
 ROUND_OFF = 1e-10
-
-
-def inner[F: Callable[..., Any]](function: F) -> F:
-    """Compile a function that only compiled code calls."""
-    return cached(error_model="numpy", **_NO_WRAPPERS)(function)
 
 
 @inner

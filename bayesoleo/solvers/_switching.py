@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesoleo._compiled import jit
+from bayesoleo._compiled import inner, jit
 from bayesoleo._types import Array, Integers
 from bayesoleo.solvers._radau_step import (
     SOLVED,
@@ -23,7 +23,6 @@ from bayesoleo.solvers._radau_step import (
     Workspace,
     copy_to,
     evaluate_kernel,
-    inner,
     interpolate,
     solve_stages,
     stretch,

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesoleo._compiled import BlockKernel, jit
+from bayesoleo._compiled import BlockKernel, inner, jit
 from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.solvers import _period_arrangement as measures
 from bayesoleo.solvers._collocation import Collocation
@@ -43,7 +43,6 @@ from bayesoleo.solvers._radau_step import (
     assemble,
     copy_to,
     evaluate_kernel,
-    inner,
     rows_of_stages,
     stretch,
     workspace,
