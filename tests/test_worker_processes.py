@@ -40,15 +40,27 @@ def slow_square(shared, item):
     return os.getpid(), shared["unit"] * item**2
 
 
-def test_results_come_in_order_from_several_processes(eager):
-    found = process_map(slow_square, {"unit": 0.5}, range(12), 2)
-    assert [value for _, value in found] == [0.5 * k**2 for k in range(12)]
+def square_in_company(folder, item):
+    """It waits until two processes are at work: on a busy machine one could have done all."""
+    (folder / str(os.getpid())).touch()
+    for _ in range(1200):
+        if len(list(folder.iterdir())) > 1:
+            break
+        time.sleep(0.05)
+    return os.getpid(), item**2
+
+
+def test_results_come_in_order_from_several_processes(eager, tmp_path):
+    found = process_map(square_in_company, tmp_path, range(12), 2)
+    assert [value for _, value in found] == [k**2 for k in range(12)]
     assert len({number for number, _ in found}) == 2
 
 
-def test_a_process_is_kept_for_the_next_call(eager):
-    first = {number for number, _ in process_map(slow_square, {"unit": 1.0}, range(12), 2)}
-    again = {number for number, _ in process_map(slow_square, {"unit": 1.0}, range(12), 2)}
+def test_a_process_is_kept_for_the_next_call(eager, tmp_path):
+    (tmp_path / "first").mkdir()
+    (tmp_path / "again").mkdir()
+    first = {n for n, _ in process_map(square_in_company, tmp_path / "first", range(12), 2)}
+    again = {n for n, _ in process_map(square_in_company, tmp_path / "again", range(12), 2)}
     assert len(first) == 2
     assert again == first
 
@@ -253,7 +265,8 @@ def test_files_of_the_folder_are_not_run_and_odd_paths_do_no_harm(eager, tmp_pat
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [*sys.path, tmp_path / "no text"])
     processes._worker(0).ask(processes._dumps((None, None, None)))
-    found = process_map(slow_square, {"unit": 1.0}, range(12), 2)
+    (tmp_path / "marks").mkdir()
+    found = process_map(square_in_company, tmp_path / "marks", range(12), 2)
     assert len({number for number, _ in found}) == 2
 
 

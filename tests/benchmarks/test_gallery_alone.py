@@ -17,6 +17,7 @@ def test_page_runs_alone(name):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_a_page_without_data_says_so_and_ends_well():
     """The sample's page of the third section."""
     done = run_alone(PAGES["silverbox"])

@@ -84,6 +84,7 @@ def test_backlash_lets_the_force_rest_at_a_reversal():
     assert np.count_nonzero(without == 0) == 0
 
 
+@pytest.mark.slow
 def test_a_small_swing_with_viscous_damping_follows_the_closed_form():
     stiffness, viscous, begin = 64.0, 0.3, 1e-3
     time = 1e-3 * np.arange(4000)

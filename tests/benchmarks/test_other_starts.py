@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from truth_systems import make
 
 from bayesoleo.discovery._fit import fit_model
@@ -12,6 +13,7 @@ from bayesoleo.discovery._other_starts import doubtful
 NUMERICS = Numerics(steps=128, jobs=1)
 
 
+@pytest.mark.slow
 def test_two_masses_whose_resonances_were_mistaken_for_each_other():
     """With stiff ground the nominal values lead to a coupling on its limit and nine times the
     noise."""

@@ -34,6 +34,7 @@ def test_time_is_taken_between_measured_errors():
     assert exponent([1, 2, 4], [3, 12, 48]) == pytest.approx(2.0)
 
 
+@pytest.mark.slow
 def test_both_schemes_are_measured_at_equal_error(duffing, oscillations):
     """Smooth motion: a high order needs fewer steps, by far where little error is wanted."""
     meshes = {"radau3": (16, 32, 64, 128), "thesis": (100, 400, 1600, 6400, 25_600)}

@@ -88,6 +88,7 @@ def test_an_effect_acts_and_may_have_a_state_of_its_own():
         assert min(ratios(made)) > 5.0
 
 
+@pytest.mark.slow
 def test_a_toleranced_constant_differs_from_its_nominal_value():
     for kind in KINDS:
         exact, loose = truth_systems.model_of(kind), truth_systems.model_of(kind, True)

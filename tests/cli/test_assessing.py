@@ -76,6 +76,7 @@ def test_half_the_frequency_is_warned_of(run, campaign, model):
     assert "write frequency = 2" in result.stdout
 
 
+@pytest.mark.slow
 def test_unused_run_is_predicted_and_scored(run, campaign, model, tmp_path):
     out = tmp_path / "point"
     result = run("estimate", campaign, "--model", model, "--out", out, "--quiet", "--jobs", 1)

@@ -119,6 +119,7 @@ BAD_MODELS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["check", "close", "estimate", "sample", "trace"])
 @pytest.mark.parametrize("name", BAD_MODELS)
 def test_bad_models(refused, campaign, model, name, command):

@@ -162,6 +162,7 @@ def test_check_touches_nothing(run, campaign, model, tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_report_from_a_result(run, made_up, tmp_path):
     path = tmp_path / "results" / "results.nc"
     write_tree(made_up.two_run_tree(), path)

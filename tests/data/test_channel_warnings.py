@@ -162,6 +162,7 @@ def test_records_of_their_own_are_no_pieces():
         assert not about_pieces(first, other)
 
 
+@pytest.mark.slow
 def test_what_rests_or_is_noise_alone_goes_on_nowhere():
     rng, t = np.random.default_rng(4), STEP * np.arange(1000)
     for still in (np.full(1000, 2.0), rng.standard_normal(1000)):

@@ -123,6 +123,7 @@ def test_a_slow_tone_is_no_drift():
     assert np.std(cleaned - motion()) == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.slow
 def test_what_repeats_after_a_drift_of_slow_noise_scatters_as_its_noise_says():
     """At the fundamental, where lines below are gone: power over its stated level."""
     rng, ratios = np.random.default_rng(12), []

@@ -203,6 +203,7 @@ def ratios(law, inputs, lines):
     return np.array([np.fft.rfft(law(u))[lines] / np.fft.rfft(u)[lines] for u in inputs])
 
 
+@pytest.mark.slow
 def test_best_linear_approximation_of_a_cubic_is_that_of_its_volterra_series():
     """Of y = u + a u^3 under random phases and F lines 1 + 3 a sigma^2 (1 - 1 / 2F), exactly."""
     a, rms, lines, rng = 0.05, 1.3, list(range(1, 20, 2)), np.random.default_rng(5)
@@ -225,6 +226,7 @@ def test_best_linear_approximation_of_a_cubic_is_that_of_its_volterra_series():
     np.testing.assert_allclose(at_excited(found, "total_sd"), total, rtol=0.03)
 
 
+@pytest.mark.slow
 def test_stochastic_distortion_of_a_cubic_is_that_of_brute_force():
     law, lines = (lambda u: u + 0.05 * u**3), list(range(1, 40, 2))
     rng = np.random.default_rng(11)
@@ -236,6 +238,7 @@ def test_stochastic_distortion_of_a_cubic_is_that_of_brute_force():
     assert found == pytest.approx(true, rel=0.1)
 
 
+@pytest.mark.slow
 def test_total_variance_falls_with_realisations_and_not_with_periods():
     def sizes(realisations, periods):
         law = lambda u: u + 0.05 * u**3  # noqa: E731

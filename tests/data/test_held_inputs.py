@@ -69,6 +69,7 @@ def declared(folder, held):
     return reduce_campaign(load_campaign(folder), jobs=1)
 
 
+@pytest.mark.slow
 def test_a_held_input_acts_half_a_sample_later(folder):
     found = {}
     for held in (True, False):

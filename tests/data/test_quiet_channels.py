@@ -53,6 +53,7 @@ def force_of(reduced):
     return record, record.signals["force"].evaluate(record.position, record.rate)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("others", ["periodic", "transient"])
 @pytest.mark.parametrize("name", SIGNALS)
 def test_only_what_is_noise_alone_counts_as_constant(tmp_path, name, others):

@@ -32,6 +32,7 @@ def test_noise_of_all_runs_of_shaker_plain(data_set):
         assert set(record.harmonics["displacement"].orders.tolist()) <= {0, 1, 2, 3}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CAMPAIGNS)
 def test_stationary_shaker_runs_keep_all_periods(data_set, name):
     reduced = reduce_campaign(load_campaign(data_set(f"campaigns/shaker-{name}")))

@@ -62,6 +62,7 @@ def exact(residual: np.ndarray, rows: np.ndarray, sides: tuple[float, ...]) -> t
     return mean, sd, *(float(np.interp(chance, below, theta)) for chance in (0.05, 0.95))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sides", [(0.5,), (0.9,), (1.0,), (0.5, 0.5), (0.9, 0.5)])
 @pytest.mark.parametrize("own", [0.05, 0.5])
 @pytest.mark.parametrize("size", [0.0, 1.5, 4.0])

@@ -84,6 +84,7 @@ def assert_known(state, values: dict[str, float]):
         assert sd < 0.1 * true
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("friction", "gap", "rise"),
     [(5.0, 3e-3, 3e-4), (5.0, 2e-3, 2e-3), (40.0, 5e-4, 1e-3)],
@@ -104,6 +105,7 @@ def test_gap_friction_and_rise_of_a_force_law_are_within_their_intervals(
     assert abs(point.theta[k]) < 3.5 * point.sd[k]
 
 
+@pytest.mark.slow
 def test_a_slider_is_scored_though_a_stiff_one_is_not_reached_from_a_soft_one(tmp_path):
     state = fitted(damper_campaign(tmp_path, noise=0.2), damper())
     assert set(scored(state, "backlash_friction")) == {"backlash_friction"}
@@ -181,6 +183,7 @@ def oscillator_campaign(folder: Path, device, noise: float = 2e-5):
     return reduce_campaign(load_campaign(folder), jobs=1)
 
 
+@pytest.mark.slow
 def test_gap_friction_and_rise_of_an_oscillator_are_within_their_intervals(tmp_path):
     reduced = oscillator_campaign(tmp_path, tuple(TRUE.values()))
     state = fitted(reduced, behind_a_gap(oscillator(), "position", "position", TRUE))

@@ -86,6 +86,7 @@ def test_what_nothing_tells_does_not_lengthen_it():
     assert beginning_of(RECORD, seen(column, 2.0 * column)).time.size == pytest.approx(alone, abs=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(KINDS))
 def test_the_prediction_of_a_hold_out_run_is_the_same(name, monkeypatch):
     model, truth = KINDS[name]

@@ -101,6 +101,7 @@ def added_first(roles, name):
     return Progress(state, after, (Round(state, (item,), {}, item, after, "", 40.0),))
 
 
+@pytest.mark.slow
 def test_what_is_nearer_beside_the_others_replaces_a_first_effect_that_was_not(tmp_path):
     """A quintic spring is taken first on purpose: it is a cubic one that is there."""
     roles = assign(damper_campaign(tmp_path, cubic_and_friction, per_period=60.3).records)
@@ -143,6 +144,7 @@ def test_an_effect_that_varies_by_run_gives_way_with_its_variation(tmp_path):
     assert loop.final.at_floor
 
 
+@pytest.mark.slow
 def test_another_first_effect_is_followed_only_where_it_leads_as_far(tmp_path):
     """Friction and a cubic spring are there: damping of another law beside either leaves more."""
     roles = assign(damper_campaign(tmp_path, cubic_and_friction, per_period=60.3).records)

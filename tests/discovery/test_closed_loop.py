@@ -55,6 +55,7 @@ def with_friction(tmp_path_factory):
     return close(reduced, damper(offsets=True)), offsets
 
 
+@pytest.mark.slow
 def test_friction_missing_in_a_force_law_is_found(with_friction):
     loop, _ = with_friction
     assert loop.effects == ("coulomb_friction",)
@@ -145,6 +146,7 @@ def test_a_cubic_spring_missing_in_an_oscillator_is_found_first(tmp_path):
     }
 
 
+@pytest.mark.slow
 def test_two_effects_are_found_one_after_the_other(tmp_path):
     def force(x, v, t):
         return 200 * v + 1000 * x + 2e6 * x**3 + FRICTION * np.sign(v)

@@ -81,6 +81,7 @@ def test_white_noise_is_seldom_taken_for_coloured():
     assert flatness_p([]) == flatness_p([np.zeros(5)]) == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("colour", COLOURED)
 @pytest.mark.parametrize("kind", ["oscillator", "lag"])
 def test_coloured_noise_is_neither_white_nor_an_effect(kind, colour):

@@ -48,6 +48,7 @@ def states(folder, seed, offsets=None):
     ]
 
 
+@pytest.mark.slow
 def test_what_fits_noise_is_charged_for_it(tmp_path):
     """On its own samples a parameter gains one on average, which is charged; across halves it
     costs two."""
@@ -282,6 +283,7 @@ def test_a_remainder_with_random_phases_scatters_as_computed(size):
     assert surrogate_variance(change, left) == pytest.approx(np.mean(np.square(drawn)), rel=0.08)
 
 
+@pytest.mark.slow
 def test_noise_of_the_input_scatters_a_fall_as_much_as_is_said(tmp_path):
     """The input's noise moves a fall along with the output's; each is counted once."""
     pulls = []
@@ -305,6 +307,7 @@ def test_noise_of_the_input_scatters_a_fall_as_much_as_is_said(tmp_path):
     assert 0.4 < np.mean(np.square(pulls)) < 1.9
 
 
+@pytest.mark.slow
 def test_errors_of_the_parameters_scatter_a_fall_as_much_as_is_said(tmp_path):
     """Small fitted runs know little of what a large one does: the noise alone is a tenth of it."""
     small = (("a", 1.0, 0.001, "fit"), ("b", 2.0, 0.001, "fit"), ("d", 1.5, 0.01, "hold-out"))

@@ -40,12 +40,14 @@ def looked_for(tmp_path, force, **options):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coloured", [0.0, 0.9])
 def test_noise_alone_is_seldom_looked_at_again(tmp_path, coloured):
     # A third of 12 at most is expected; 9 or more happen less than once in two hundred times.
     assert looked_for(tmp_path, spring_damper_force, coloured=coloured) < 9
 
 
+@pytest.mark.slow
 def test_an_effect_at_its_detection_limit_is_looked_for(tmp_path):
     """Friction that changes the outputs by five standard deviations beside the parameters."""
     noise = 0.5
@@ -63,6 +65,7 @@ def test_an_effect_at_its_detection_limit_is_looked_for(tmp_path):
     assert looked_for(tmp_path, small, noise=noise) > SEEDS - 3
 
 
+@pytest.mark.slow
 def test_errors_of_the_catalogue_are_not_chosen_where_priors_would_decide(tmp_path, monkeypatch):
     """The estimate under these errors leaves the signal to effects: it is not taken."""
     fit = fit_of(tmp_path, with_friction)

@@ -57,6 +57,7 @@ def mean_square(errors) -> float:
     return float(np.mean([entry.ratio**2 for entry in errors.entries]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("per_period", [100.0, 100.37, 41.7])
 def test_pure_noise_has_ratio_one(tmp_path, per_period):
     reduced = damper_campaign(tmp_path, spring_damper_force, runs=RUNS, per_period=per_period)

@@ -49,6 +49,7 @@ def fitted(folder, force, seed=0, masked=0.0, **more):
     return fit_state(Assembly(damper(cubic=False)), assign(records), NUMERICS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("force", [smooth, spiky])
 def test_errors_of_hundreds_of_swings_are_seen(tmp_path, force):
     """Averages over whole swings would have left nothing of them."""
@@ -60,6 +61,7 @@ def test_errors_of_hundreds_of_swings_are_seen(tmp_path, force):
     assert not state.at_floor
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("force", [smooth, spiky])
 def test_shares_are_of_all_that_samples_have_beyond_their_noise(tmp_path, force):
     state = fitted(tmp_path, force)
@@ -79,6 +81,7 @@ def peaks(x, v, _):
     return 1000.0 * x + 200.0 * v + 5.0 * np.exp(-((v / 0.001) ** 2)) * np.sign(x)
 
 
+@pytest.mark.slow
 def test_shares_of_short_errors_in_slow_motions_are_of_single_samples(tmp_path):
     """Averages over thirty samples lose most of a peak of ten, which holds little of the force."""
     state = fitted(tmp_path, peaks, **(FEW | {"noise": 0.2}))
@@ -95,6 +98,7 @@ def plain(x, v, _):
     return 1000.0 * x + 200.0 * v
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("swings", [MANY, FEW])
 @pytest.mark.parametrize("masked", [0.0, 0.1, 0.3])
 def test_noise_has_no_excess(tmp_path, swings, masked):
@@ -113,6 +117,7 @@ def test_noise_has_no_excess(tmp_path, swings, masked):
     assert np.mean(np.square(ratios)) == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_slow_errors_beside_fast_motions_are_seen(tmp_path):
     def drifting(x, v, time):
         return plain(x, v, time) + 0.6 * np.sin(2 * np.pi * 1.3 * time / time[-1])
@@ -122,6 +127,7 @@ def test_slow_errors_beside_fast_motions_are_seen(tmp_path):
     assert all(entry.ratio > 1.5 for entry in state.fit_errors.entries)
 
 
+@pytest.mark.slow
 def test_a_short_burst_at_the_start_is_seen(tmp_path):
     def begun(x, v, time):
         return plain(x, v, time) + 6.0 * np.sin(time * 900.0) * (time < 0.02 * time[-1])
@@ -130,6 +136,7 @@ def test_a_short_burst_at_the_start_is_seen(tmp_path):
     assert not state.at_floor
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("masked", [0.0, 0.3])
 def test_errors_of_poorly_known_unknowns_are_no_missing_effect(tmp_path, masked):
     """They are as fast as the motion: single samples of hold-out runs show them."""
@@ -154,6 +161,7 @@ def saturating(x, v, _):
     return plain(x, v, _) + 20.0 * np.tanh(v / 0.01)
 
 
+@pytest.mark.slow
 def test_estimated_effects_are_alike_by_the_noise_along_their_difference(tmp_path, monkeypatch):
     state = fitted(tmp_path, saturating, noise=0.05)
     base = state.base()
@@ -192,6 +200,7 @@ def models(residuals, *, reached=False):
     return base, *made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("colour", [0.0, 0.9])
 @pytest.mark.parametrize(("size", "parts"), [(3.0, 0.5), (30.0, 0.5), (100.0, 1.0)])
 def test_two_wrong_models_are_told_apart_by_chance_in_one_case_of_twenty(colour, size, parts):
@@ -236,6 +245,7 @@ def test_fits_that_do_not_differ_or_have_no_solution_have_no_noise_between_them(
     assert difference.undecided(base, one, other).most == POLICY.equal_likelihood
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transients", [False, True])
 def test_white_noise_between_fits_is_that_of_the_samples(tmp_path, transients):
     """Of periodic runs, and of these beside transients."""

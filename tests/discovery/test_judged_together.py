@@ -52,6 +52,7 @@ def with_effects(reduced, *names):
     return state, roles
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coloured", [0.0, 0.97])
 def test_the_inflation_of_a_transient_holds_colour_and_level(tmp_path, coloured):
     """Sums of squares are in units of what differences of neighbours show of the noise."""
@@ -238,6 +239,7 @@ def _as_periodic(state: State):
     return SimpleNamespace(fit=fit), state.base()
 
 
+@pytest.mark.slow
 def test_p_values_of_absent_effects_in_slow_noise_are_seldom_small(tmp_path):
     small, tried = 0, 0
     for seed in range(8):
@@ -285,6 +287,7 @@ def test_the_error_of_a_fall_is_that_of_a_chi_square_in_units_of_the_noise(rise,
     assert fall_error(mean, size, inflation) == pytest.approx(np.std(draws), rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_quiet_run_tells_as_much_as_it_does(tmp_path):
     """The level of all runs together is far above its noise; the colour makes up for it."""
     stated = []
@@ -312,6 +315,7 @@ def test_a_quiet_run_tells_as_much_as_it_does(tmp_path):
     assert np.median(stated) < 400.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("judged", [True, False])
 @pytest.mark.parametrize("broken", [True, False])
 def test_a_stopped_search_says_that_its_effects_are_on_trial(tmp_path, broken, judged):

@@ -34,6 +34,7 @@ def resonator() -> Model:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("input_noise", "noise"), [(0.1, 1e-3), (1e-4, 0.1)], ids=["of the force", "of the output"]
 )
@@ -60,6 +61,7 @@ def test_the_deviation_of_an_estimate_counts_the_noise_of_a_measured_input(input
     assert state.sd_of("mass") is None
 
 
+@pytest.mark.slow
 def test_absent_effects_are_seldom_significant_beside_the_noise_of_a_measured_input():
     """Where it did not count, all these p-values were below a twentieth, and most were zero."""
     effects = [
@@ -84,6 +86,7 @@ def test_absent_effects_are_seldom_significant_beside_the_noise_of_a_measured_in
     assert not (small < 1e-3).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lines", [60, 200], ids=["a coefficient each", "sums of coefficients"])
 def test_scores_of_absent_effects_count_the_noise_of_every_input_coefficient(lines):
     """Where the largest 256 coefficients alone counted, scores were significant."""

@@ -129,6 +129,7 @@ def test_what_is_linear_in_a_logarithm_stays_so():
     np.testing.assert_allclose(quantiles_of(made)[0], wanted, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "priors",
     [
@@ -281,6 +282,7 @@ def slope_state(tmp_path_factory):
     return fitted(damper_campaign(tmp_path_factory.mktemp("rub"), rubbing, noise=2.0), model)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prior", [StructurePrior(), StructurePrior(nothing=0.1, outside=0.8)])
 def test_intervals_of_all_structures_lie_in_the_supports(slope_state, prior):
     base = slope_state.base()

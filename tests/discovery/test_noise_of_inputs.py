@@ -103,6 +103,7 @@ def test_what_only_noise_of_the_input_leaves_is_no_missing_effect(kind):
     assert "noise of measured inputs" in found.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "change"),
     [(kind, more) for kind in TRUTHS for more in ({"noise": 1e-5}, {"cubic": "much"})],

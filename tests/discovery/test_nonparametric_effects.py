@@ -60,6 +60,7 @@ def test_splines_of_an_axis_are_shifted_copies_of_one():
     np.testing.assert_allclose(axis.basis(values, pieces), expected, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_what_the_catalogue_lacks_ends_as_a_curve_without_a_name(strange):
     assert strange.effects == ("nonparametric_displacement",)
     assert strange.verdict == schema.EFFECT_ADDED

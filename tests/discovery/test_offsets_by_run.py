@@ -49,6 +49,7 @@ def with_offsets(folder, shown):
     return oscillator_campaign(folder, restoring=hardening, each=each)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shown", [True, False])
 def test_what_the_sensor_adds_is_told_from_what_pushes(shown, tmp_path):
     """A spring that hardens makes harmonics of what pushes, and none of what the sensor adds."""

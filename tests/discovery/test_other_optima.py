@@ -32,6 +32,7 @@ def oscillator(resonance):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("start", "told"), [(10.0, False), (17.0, True)])
 def test_the_other_side_of_a_frequency_that_was_driven(tmp_path, start, told):
     reduced = oscillator_campaign(

@@ -37,6 +37,7 @@ def closed(roles, **more):
     return close_loop(Assembly(damper()), roles, NUMERICS, effects=EFFECTS, seed=3, **more)
 
 
+@pytest.mark.slow
 def test_each_round_adds_to_the_work(searched):
     _, loop, kept = searched
     work = [work_of(item) for item in kept]
@@ -72,6 +73,7 @@ def test_a_first_round_is_always_looked_at(searched):
     assert found.effects == loop.effects[:1]
 
 
+@pytest.mark.slow
 def test_a_search_that_ends_by_itself_is_complete_whatever_its_work(searched):
     roles, loop, kept = searched
     found = closed(roles, most_work=work_of(kept[-2]) - 1.0)
@@ -80,6 +82,7 @@ def test_a_search_that_ends_by_itself_is_complete_whatever_its_work(searched):
     assert found.effects == loop.effects
 
 
+@pytest.mark.slow
 def test_it_is_not_noticed_where_less_was_to_be_done(searched):
     roles, loop, kept = searched
     found = closed(roles, most_work=2.0 * work_of(kept[-1]))
@@ -88,6 +91,7 @@ def test_it_is_not_noticed_where_less_was_to_be_done(searched):
     np.testing.assert_array_equal(found.final.fit.point.theta, loop.final.fit.point.theta)
 
 
+@pytest.mark.slow
 def test_without_the_limit_it_goes_on_to_the_same_end(searched):
     roles, loop, kept = searched
     reached = []
@@ -116,6 +120,7 @@ def test_an_effect_on_trial_waits_for_the_one_that_it_was_added_for(searched):
     assert found.complete
 
 
+@pytest.mark.slow
 def test_most_effects_are_a_reason_of_their_own(searched):
     roles, loop, _ = searched
     found = closed(roles, most_work=1.0, max_effects=1)

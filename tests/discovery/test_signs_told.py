@@ -10,6 +10,7 @@ from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._loop import OTHER_SIGN, close_loop
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_parameters_of_the_other_sign_are_told(tmp_path, sign):
     reduced = damper_campaign(tmp_path, lambda x, v, t: sign * (STIFFNESS * x + DAMPING * v))

@@ -26,6 +26,7 @@ def log_density(z: np.ndarray, covariance: np.ndarray) -> float:
     return float(-0.5 * (z @ np.linalg.solve(covariance, z) + np.linalg.slogdet(covariance)[1]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["none", "few curves", "resonance", "white"])
 def test_errors_by_draws_have_nearly_the_density_of_their_covariance(kind):
     """Whatever its rank, with noise on top; and far more than by the variances of lines alone where

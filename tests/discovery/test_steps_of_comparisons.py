@@ -47,6 +47,7 @@ def squares(fit):
     )
 
 
+@pytest.mark.slow
 def test_an_estimate_is_that_of_the_equations(fitted):
     _, truth, fit = fitted
     assert not fit.shift > fit.policy.mesh_shift
@@ -152,6 +153,7 @@ def test_a_candidate_is_refined_where_its_steps_show(fitted):
     assert worst < 1.0
 
 
+@pytest.mark.slow
 def test_an_end_stop_in_few_samples_counts_in_full():
     model, truth = KINDS["stop"]
     data = record(model, truth)
@@ -170,6 +172,7 @@ def test_an_end_stop_in_few_samples_counts_in_full():
     assert abs(falls[0] - falls[1]) < 0.02 * falls[1] + 6.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fitted", ["lag", "friction"], indirect=True)
 def test_a_hold_out_run_has_steps_of_its_own(fitted):
     name, truth, fit = fitted
@@ -201,6 +204,7 @@ def failing(monkeypatch, fails):
     monkeypatch.setattr(Predictor, "solved_anew", solved_anew)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fitted", "coarse"), [("lag", True), ("friction", False)], indirect=["fitted"]
 )

@@ -432,6 +432,7 @@ def test_variations_of_a_held_out_transient_begin_with_its_motion(monkeypatch):
         assert value == pytest.approx(told[1][key], rel=1e-3, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_another_process_judges_runs_alike(monkeypatch):
     """Each finds where variations begin by itself."""
     monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)

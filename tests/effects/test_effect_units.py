@@ -11,6 +11,7 @@ from bayesoleo.model import Model, Parameter
 from bayesoleo.systems import system
 
 
+@pytest.mark.slow
 def test_every_balance_of_an_extended_model_has_one_unit(united_model, offered):
     for candidate in offered(united_model):
         extended = candidate.model

@@ -22,6 +22,7 @@ def rows(names_and_orders) -> np.ndarray:
     return np.array(found).reshape(len(found), POINTS.shape[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["f16n1d2", "viscous_damper"])
 def test_kernels_are_finite_at_the_null(name, offered):
     for candidate in offered(system(name)):

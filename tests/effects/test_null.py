@@ -44,6 +44,7 @@ def value(expression: sp.Expr, state: dict) -> float:
     return float(sp.lambdify([], expression.xreplace({k: sp.Float(v) for k, v in state.items()}))())
 
 
+@pytest.mark.slow
 def test_extended_model_at_null_is_the_old_one(model, offered):
     rng = np.random.default_rng(1)
     found = offered(model)
@@ -62,6 +63,7 @@ def test_extended_model_at_null_is_the_old_one(model, offered):
                 assert new == pytest.approx(old, rel=1e-9, abs=1e-6), candidate.effect
 
 
+@pytest.mark.slow
 def test_added_equations_determine_the_added_dofs_at_null(model, offered):
     rng = np.random.default_rng(2)
     for candidate in offered(model):
@@ -74,6 +76,7 @@ def test_added_equations_determine_the_added_dofs_at_null(model, offered):
             assert np.any(np.abs(slopes) > 1e-9), (candidate.effect, dof)
 
 
+@pytest.mark.slow
 def test_amplitudes_move_something(model, offered):
     """No amplitude is left out of the extended model."""
     for candidate in offered(model):

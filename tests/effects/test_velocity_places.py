@@ -167,6 +167,7 @@ def test_the_form_of_a_model_does_not_change_what_may_be_missing(bodies):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", catalogue(), ids=lambda effect: effect.id)
 def test_an_effect_is_the_same_law_in_either_form(effect):
     plain, states = chain(2, states=False), chain(2, states=True)

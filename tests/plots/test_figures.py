@@ -49,6 +49,7 @@ def test_figures_of_a_tree(oleo, draw):
     assert len(texts(draw(oleo))) > 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("draw", "output"),
     [

@@ -61,6 +61,7 @@ def test_one_realisation_has_no_scatter_and_a_sine_has_harmonics():
     assert any(text.startswith("1.000 N rms, 1 realisation, ") for text in shown)
 
 
+@pytest.mark.slow
 def test_many_levels_are_cut_and_said_so():
     levels = tuple(0.5 * 1.5**k for k in range(8))
     found = frequency_response(

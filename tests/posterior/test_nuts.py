@@ -86,6 +86,7 @@ def moments(problem):
     return mean, np.sqrt(square - mean**2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [0.0, 1.0])
 def test_a_hierarchy_is_the_exact_one(spread):
     # Where the runs are alike the spread is a funnel's neck.

@@ -47,6 +47,7 @@ def killed_run_is_the_same(folder: Path, kills: int, seed: int) -> None:
     same(run(Gaussian(np.ones(2)), folder), run(Gaussian(np.ones(2)), None))
 
 
+@pytest.mark.slow
 def test_a_killed_run_ends_with_the_same_draws(tmp_path):
     killed_run_is_the_same(tmp_path, 1, seed=0)
 

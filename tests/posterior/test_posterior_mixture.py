@@ -47,6 +47,7 @@ def test_draws_have_the_mixture_s_moments(two):
     np.testing.assert_allclose(draws.mean(axis=0), mean, atol=4 * 2 / np.sqrt(200_000))
 
 
+@pytest.mark.slow
 def test_refitting_recovers_the_mixture(two):
     draws = two.sample(np.random.default_rng(0), 40_000)
     wrong = Mixture(two.centres + 0.5, 2 * two.covariances, np.zeros(2))

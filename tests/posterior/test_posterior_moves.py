@@ -52,6 +52,7 @@ def tolerance(dimension: int, groups: int) -> float:
 KINDS = ["differential", "snooker", "independence"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("dimension", "scale"), [(2, 0.1), (4, 10.0), (9, 1.0)])
 def test_moves_are_stationary(kind, dimension, scale):

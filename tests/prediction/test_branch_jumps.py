@@ -72,6 +72,7 @@ def test_a_step_over_the_fold_is_reported_and_a_walk_up_to_it_is_not(fold):
     assert made.runs[0].jumps == 1
 
 
+@pytest.mark.slow
 def test_lanes_of_a_batch_are_told_apart(fold):
     """Lanes over parameters far and near: those on another branch than continuation, no others."""
     made, theta = predictor(110.0)

@@ -226,6 +226,7 @@ def by_inputs(fit, base, changes):
     return 0.9 * found
 
 
+@pytest.mark.slow
 def test_absent_effects_in_mixed_runs_count_the_noise_of_measured_inputs():
     """A transient among the runs must not hide what repeats in the others."""
     effects = [

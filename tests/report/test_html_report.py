@@ -60,6 +60,7 @@ def without(tree, *names):
     return cut
 
 
+@pytest.mark.slow
 def test_the_page_makes_its_case(page):
     for text in (
         "Probable: Stribeck friction was missing.</h1>",
@@ -103,6 +104,7 @@ def test_no_value_is_left_out_by_accident(page):
     assert not re.search(r"\b(nan|None|inf|undefined)\b", visible)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unpainted")
 def test_what_a_user_wrote_is_text(synthetic):
     evil = "<script>alert(1)</script>"
@@ -281,6 +283,7 @@ def test_a_transient_is_not_averaged_over_periods(two_runs):
     assert viewer_data(page)["outputs"][0]["runs"][0]["x_label"] == "time in s"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unpainted")
 def test_noise_has_one_meaning(oleo):
     """That of a sample; errors are compared with a standard error, or with what is expected."""
@@ -301,6 +304,7 @@ def test_the_first_screen_says_on_which_runs(page, two_runs):
     assert runs_used(summary).endswith("no run was held out to test it.")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unpainted")
 def test_the_reason_of_the_error_model_is_on_the_page(synthetic):
     tree = synthetic.oleo_tree()

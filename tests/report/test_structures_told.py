@@ -258,6 +258,7 @@ def weighed(synthetic):
     return tree
 
 
+@pytest.mark.slow
 def test_table_figure_and_terminal_of_a_result(weighed):
     summary = json.loads(weighed.attrs["summary"])
     page = render_report(weighed)

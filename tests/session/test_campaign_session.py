@@ -74,6 +74,7 @@ def test_problem_says_what_would_be_fitted(problem: bo.Problem) -> None:
     assert isinstance(check.data_warnings, list)
 
 
+@pytest.mark.slow
 def test_fit_is_that_of_the_command_line(problem: bo.Problem, fit: bo.Fit) -> None:
     check_shown(fit, "fit of damper", "damping", "converged")
     assert problem.fit() is fit
@@ -84,6 +85,7 @@ def test_fit_is_that_of_the_command_line(problem: bo.Problem, fit: bo.Fit) -> No
     assert fit.parameters.loc["damping", "unit"] == "N*s/m"
 
 
+@pytest.mark.slow
 def test_a_search_begins_with_the_estimate_that_was_made(
     campaign: bo.Campaign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -166,6 +168,7 @@ def test_what_is_missing_has_probabilities(found: bo.Explanation) -> None:
     assert 0.95 < float(known["structure_probability"].sum()) <= 1.0 + 1e-9
 
 
+@pytest.mark.slow
 def test_report_and_posterior_of_what_was_found(found: bo.Explanation, tmp_path: Path) -> None:
     posterior = found.sample()
     check_shown(posterior, "posterior of damper")
@@ -173,6 +176,7 @@ def test_report_and_posterior_of_what_was_found(found: bo.Explanation, tmp_path:
     assert "posterior" in page.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", ["fit", "posterior", "found"])
 def test_results_are_saved_and_loaded(
     step: str, request: pytest.FixtureRequest, campaign: bo.Campaign, tmp_path: Path

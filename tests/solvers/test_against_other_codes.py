@@ -32,6 +32,7 @@ def coupled_rates(t, y, force):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["radau3", "gauss3"])
 @pytest.mark.parametrize("integrator", ["DOP853", "LSODA"])
 @pytest.mark.parametrize(

@@ -131,6 +131,7 @@ def test_the_scheme_is_that_of_the_differential_equations(d):
     np.testing.assert_allclose(values, exact, atol=1e-6)  # (3 omega h)**6, with rates above 1 too
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [13, 64])
 @pytest.mark.parametrize(
     ("d", "name"), [(3, "radau2"), (3, "radau3"), (5, "gauss3"), (6, "radau3")]

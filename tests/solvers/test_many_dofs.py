@@ -129,6 +129,7 @@ def in_order(d):
     return [*range(0, 2 * d, 2), *range(1, 2 * d, 2)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("d", "ties", "n"),
     [
@@ -213,6 +214,7 @@ def test_nothing_is_left_of_the_solve_before(ties):
     np.testing.assert_array_equal(again.x, first.x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("d", [2, 3, 4])
 def test_near_a_solution_derivatives_are_made_once(d, monkeypatch):
     """A first step of a thousandth of the motion is what a prediction leaves; three more with the

@@ -102,6 +102,7 @@ def test_derivatives_against_high_precision_differences(model):
                 np.testing.assert_allclose(table[0, :, k, 0], exact, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.reference
 def test_the_variational_form_integrates_to_differences_of_solutions():
     space, p = state_space(coupled())

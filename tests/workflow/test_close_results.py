@@ -194,6 +194,7 @@ def test_what_is_expected_of_a_run_that_the_result_does_not_hold_is_near_what_th
     assert float(found["expected_error"][0, 0]) > 10 * float(same["expected_error"][0, 0])
 
 
+@pytest.mark.slow
 def test_a_second_close_takes_up_the_checkpoints_and_agrees(closed, campaign):
     tree, out = closed
     store = out / "checkpoints"

@@ -187,6 +187,7 @@ def test_the_command_line_predicts_and_simulates_with_it(fit, saved, folder):
     assert means["with"] - means["without"] == pytest.approx(one["offset"], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_each_draw_of_a_posterior_has_a_draw_of_the_offset(fit, folder, monkeypatch):
     """The estimate in all draws: only the offset differs, by its standard deviation."""
     (values,) = simulating.parameter_sets(fit.tree, None, 0)

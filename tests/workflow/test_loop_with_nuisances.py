@@ -35,6 +35,7 @@ def first_round(tree):
     return json.loads(tree.attrs[schema.SUMMARY])["rounds"][0]
 
 
+@pytest.mark.slow
 def test_ranking_is_not_blurred_by_what_a_sensor_may_be_off(campaign):
     free, held = (workflow.trace(campaign, damper(), settings) for settings in (FREE, HELD))
     best = [first_round(tree)["candidates"][0] for tree in (free, held)]

@@ -22,6 +22,7 @@ def campaign(tmp_path_factory):
     return damper_campaign(tmp_path_factory.mktemp("nuts") / "damper", spring_damper_force)
 
 
+@pytest.mark.slow
 def test_the_result_says_which_sampler_drew(campaign, tmp_path):
     tree = workflow.sample(campaign, damper(), SETTINGS, out=tmp_path)
     back = read_tree(tmp_path / "results.nc")

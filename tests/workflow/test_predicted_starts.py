@@ -119,6 +119,7 @@ def reduced(folder, kind: str):
     return reduce_campaign(load_campaign(folder), jobs=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(TRUTHS))
 def test_a_new_transient_is_foreseen_to_its_noise(tmp_path, kind):
     campaign = reduced(tmp_path, kind)
@@ -209,6 +210,7 @@ def drawn_for(
     return drawn_starts(predictor, theta, starts, draws, np.array([noise]), rng)[:, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sd", [0.1, 0.005, 0.002])
 def test_a_start_is_known_by_its_record_and_by_its_prior(sd):
     """Truths drawn from the prior, which is worse than the record, as good, and better."""
@@ -221,6 +223,7 @@ def test_a_start_is_known_by_its_record_and_by_its_prior(sd):
     assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1.0, abs=3 / np.sqrt(80))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("memory", [0.5, 0.9, 0.97])
 def test_a_start_beside_correlated_noise_is_known_less_well(memory):
     """As independent, samples would tell it up to three times better than they do."""

@@ -28,6 +28,7 @@ def tree(campaign):
     return sampled(campaign, error_model="discrepancy")
 
 
+@pytest.mark.slow
 def test_friction_that_is_missing_widens_the_intervals_of_a_discrepancy(campaign, tree):
     white = sampled(campaign, error_model="independent")
     # Cubic stiffness keeps its meaning beside friction.
@@ -109,6 +110,7 @@ def test_draws_can_be_simulated_with(campaign, tree, tmp_path):
     assert (tmp_path / "new" / "campaign.toml").is_file()
 
 
+@pytest.mark.slow
 def test_independent_errors_without_friction_need_nothing_else(tmp_path):
     campaign = damper_campaign(tmp_path, spring_damper_force)
     tree = sampled(campaign, error_model="discrepancy")

@@ -35,6 +35,7 @@ def proposed(reduced):
     return workflow.propose(reduced, model, SETTINGS, limits=WIDE)
 
 
+@pytest.mark.slow
 def test_the_group_holds_every_run_with_its_place(proposed):
     group = proposed[schema.PROPOSAL].to_dataset()
     assert group.sizes == {"round": 1, "mean": 1, "amplitude": 6, "frequency": 6}

@@ -89,6 +89,7 @@ def check_unfinished(folder: Path, error: UnfinishedError, stage: str) -> dict:
     return summary
 
 
+@pytest.mark.slow
 def test_a_search_that_breaks_off_keeps_the_rounds_before(campaign, whole, tmp_path, monkeypatch):
     without_draws(monkeypatch)
     monkeypatch.setattr(search, "examine", failing_round(2))
@@ -118,6 +119,7 @@ def test_a_search_that_breaks_off_at_once_keeps_the_estimate(campaign, tmp_path,
     assert summary["effects"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stage", "module", "name"),
     [
@@ -143,6 +145,7 @@ def test_a_late_stage_that_fails_leaves_the_others(
     assert summary["rounds"][0]["error"]["force"]["a"]["ratio_to_noise"] > 2.0
 
 
+@pytest.mark.slow
 def test_a_figure_that_fails_leaves_the_page(campaign, tmp_path, monkeypatch):
     monkeypatch.setattr("bayesoleo.plots.records", broken)
     with pytest.raises(UnfinishedError, match="figure of the data could not be drawn"):
@@ -153,6 +156,7 @@ def test_a_figure_that_fails_leaves_the_page(campaign, tmp_path, monkeypatch):
     assert "could not be drawn" in page
 
 
+@pytest.mark.slow
 def test_a_posterior_that_fails_leaves_the_effect(campaign, tmp_path, monkeypatch):
     monkeypatch.setattr(closing, "draw", broken)
     with pytest.raises(UnfinishedError) as caught:
@@ -191,6 +195,7 @@ def test_an_estimate_that_fails_is_an_error_and_leaves_an_older_result(
     assert (tmp_path / "results.nc").read_text() == "older"
 
 
+@pytest.mark.slow
 def test_an_older_result_is_put_aside_until_the_new_one_is_complete(
     campaign, tmp_path, monkeypatch
 ):
@@ -216,6 +221,7 @@ def test_a_folder_that_fails_on_the_way_does_not_end_the_work(campaign, tmp_path
     assert json.loads(tree.attrs[schema.SUMMARY])["unfinished"] == []
 
 
+@pytest.mark.slow
 def test_a_search_of_seconds_writes_once_and_is_kept_all_the_same(campaign, tmp_path, monkeypatch):
     without_draws(monkeypatch)
     without_page(monkeypatch)
@@ -232,6 +238,7 @@ def test_a_search_of_seconds_writes_once_and_is_kept_all_the_same(campaign, tmp_
     assert (tmp_path / "results.nc").exists()
 
 
+@pytest.mark.slow
 def test_a_result_whose_draws_cannot_be_written_leaves_the_effect(campaign, tmp_path, monkeypatch):
     rightly = output.result_tree
 
@@ -247,6 +254,7 @@ def test_a_result_whose_draws_cannot_be_written_leaves_the_effect(campaign, tmp_
     assert [one["stage"] for one in summary["unfinished"]] == ["report", "posterior"]
 
 
+@pytest.mark.slow
 def test_files_that_fail_beside_the_figures_are_tried_again(campaign, tmp_path, monkeypatch):
     rightly, tried = output.write_files, []
 
@@ -268,6 +276,7 @@ def _page_of_nothing(_, path, before):
     return []
 
 
+@pytest.mark.slow
 def test_an_older_result_is_not_taken_for_the_one_that_cannot_be_written(
     campaign, tmp_path, monkeypatch
 ):
@@ -295,6 +304,7 @@ def broken_off(campaign, tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changed", ["campaign", "model", "setting", "file"])
 def test_another_task_starts_anew_and_says_so(campaign, broken_off, tmp_path, monkeypatch, changed):
     without_draws(monkeypatch)
@@ -455,6 +465,7 @@ def test_every_kind_of_path_is_taken(campaign, tmp_path, kind):
     assert read_tree(out / "results.nc").attrs[schema.MODEL] == "damper"
 
 
+@pytest.mark.slow
 def test_a_longer_search_goes_on_where_a_quick_one_ended(tmp_path, monkeypatch):
     """By the same command without ``--quick``."""
 
