@@ -135,8 +135,8 @@ def cached[F: Callable[..., Any]](**options: Any) -> Callable[[F], F]:
 #: none of them.
 jit = cached(error_model="numpy", no_cfunc_wrapper=True)
 #: The same for a function that only compiled code calls. A wrapper unpacks every argument that
-#: Python may give; where these are arrays it can take longer to compile than what it wraps. Without one, a call by
-#: Python ends the process.
+#: Python may give; where these are arrays it can take longer to compile than what it wraps. Without
+#: one, a call by Python ends the process.
 inner = cached(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 #: The same for a function that others call in one place or two: its instructions become theirs. The
 #: compiler makes machine code of each function and then once more of all that calls it, so that a
