@@ -14,6 +14,7 @@ from bayesoleo.prediction._periodic_run import RunPredictor
 LEAST, MOST = 0.85, 0.95
 
 
+@pytest.mark.slow
 def test_intervals_of_two_parameters_that_hardly_show_hold_what_they_say():
     """Linearised about the estimate they held 45 and 61 % of the posterior, and that of the
     damping, which seemed well known, 50 %."""

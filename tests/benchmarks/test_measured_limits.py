@@ -95,6 +95,7 @@ def test_a_small_swing_with_viscous_damping_follows_the_closed_form():
     np.testing.assert_allclose(found, begin * expected, atol=2e-5 * begin)
 
 
+@pytest.mark.slow
 def test_a_swing_loses_what_coulomb_friction_takes():
     stiffness, coulomb = 64.0, 0.2
     time = 1e-3 * np.arange(4000)

@@ -43,6 +43,7 @@ def test_both_schemes_are_measured_at_equal_error(duffing, oscillations):
     assert found["equal_error_ratio_1e-8"] > 10.0
 
 
+@pytest.mark.slow
 def test_errors_beside_times(duffing, oscillations):
     found = solves.accuracy(duffing, oscillations)
     assert found["default_error_worst"] < 1e-8 < found["error_worst"] < 1e-2

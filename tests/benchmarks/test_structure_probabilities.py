@@ -151,6 +151,7 @@ def test_the_figure_has_a_panel_for_each_way_of_drawing():
 SMALL = 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("missing", "name", "amplitude"),
     [

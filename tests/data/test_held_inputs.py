@@ -126,6 +126,7 @@ def test_samples_of_a_held_course_are_those_of_its_harmonics():
     assert between_samples(np.full(5, 2.0)) == pytest.approx(2.0)
 
 
+@pytest.mark.slow
 def test_a_warning_says_what_steps_may_feign(folder):
     with pytest.warns(DataWarning, match=r"held = true under \[channels\.u\].*0\.025 s, half"):
         prepare(declared(folder, False), model(), Settings(jobs=1))

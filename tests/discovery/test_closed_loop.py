@@ -68,6 +68,7 @@ def test_friction_missing_in_a_force_law_is_found(with_friction):
     assert abs(value - FRICTION) < 4 * sd + 0.02 * FRICTION
 
 
+@pytest.mark.slow
 def test_the_last_round_accepts_nothing_and_every_other_one_does(with_friction):
     loop, _ = with_friction
     assert all(entry.accepted is not None for entry in loop.rounds[:-1])
@@ -170,6 +171,7 @@ def disturbed(x, v, t):
     return spring_damper_force(x, v, t) + 3.0 * np.cos(2 * np.pi * 7 * cycles + 1.0)
 
 
+@pytest.mark.slow
 def test_an_effect_outside_the_catalogue_leaves_a_remainder(tmp_path):
     loop = close(damper_campaign(tmp_path, disturbed), damper())
     assert loop.verdict == schema.UNEXPLAINED
@@ -179,6 +181,7 @@ def test_an_effect_outside_the_catalogue_leaves_a_remainder(tmp_path):
             assert entry.accepted.gain < 0.5
 
 
+@pytest.mark.slow
 def test_what_the_hold_out_runs_contradict_is_not_added(tmp_path):
     """Friction in the fitted runs; the others have the damping that a fit without it finds."""
 

@@ -256,6 +256,7 @@ def test_p_values_of_absent_effects_in_slow_noise_are_seldom_small(tmp_path):
     assert tried >= 5
 
 
+@pytest.mark.slow
 def test_two_models_are_compared_by_the_noise_along_their_difference(tmp_path):
     """As the better of them leaves it: what the worse one lacks is no noise."""
     said, drawn, rng = [], [], np.random.default_rng(1)

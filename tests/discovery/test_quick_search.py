@@ -51,6 +51,7 @@ def test_each_round_adds_to_the_work(searched):
     assert loop.complete
 
 
+@pytest.mark.slow
 def test_it_ends_after_the_round_in_which_the_work_was_done(searched):
     roles, loop, kept = searched
     found = closed(roles, most_work=work_of(kept[1]) - 1.0)

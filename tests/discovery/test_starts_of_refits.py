@@ -64,6 +64,7 @@ def scored() -> tuple[Base, Score]:
     return base, score
 
 
+@pytest.mark.slow
 def test_a_score_says_how_the_present_unknowns_move(scored: tuple[Base, Score]) -> None:
     base, score = scored
     moved = dict(zip(base.fit.problem.names, score.beside, strict=True))

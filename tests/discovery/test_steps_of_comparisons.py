@@ -54,6 +54,7 @@ def test_an_estimate_is_that_of_the_equations(fitted):
     assert np.all(np.abs(fit.point.theta[: len(truth)] - truth) < 4 * fit.point.sd[: len(truth)])
 
 
+@pytest.mark.slow
 def test_no_decision_depends_on_the_steps_of_a_comparison(fitted):
     _, _, fit = fitted
     base = for_comparison(fit)

@@ -179,6 +179,7 @@ def test_a_motion_beyond_the_limits_is_not_proposed(springs):
     assert len(found.trials) < len(planned_runs(narrow, reduced.records, "displacement"))
 
 
+@pytest.mark.slow
 def test_a_force_driven_oscillator_is_served_too(tmp_path):
     """A spring that hardens, or two: what is softer or harder in small motions shows in large."""
     reduced = oscillator_campaign(

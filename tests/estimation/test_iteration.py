@@ -38,6 +38,7 @@ def test_the_unit_of_a_parameter_does_not_matter(decades, method):
     np.testing.assert_allclose(other.sd * [1, unit], plain.sd, rtol=1e-7)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=40)
 @example(start=(-6.8e-162, 0.0), method="gauss-newton")  # the rate's variance is beyond all numbers
 @given(

@@ -16,6 +16,7 @@ from bayesoleo.model._priors import LogNormal, Normal, TruncatedNormal, Uniform
 from bayesoleo.prediction._predictor import Predictor
 
 
+@pytest.mark.slow
 def test_ishigami_function():
     a, b = 7.0, 0.1
 

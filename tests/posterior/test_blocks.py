@@ -48,6 +48,7 @@ def test_a_block_is_a_period_or_a_stretch():
     assert len(Blocks.of(RunSamples(time, 1.0), 1).starts) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("word", ["full", "shared-discrepancy"])
 def test_two_outputs_and_many_runs(word):
     rng = np.random.default_rng(1)

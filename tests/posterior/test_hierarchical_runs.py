@@ -78,6 +78,7 @@ def test_a_spread_of_any_size_is_kept():
     np.testing.assert_allclose(back, spread, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [0.0, 1.0])
 def test_the_posterior_is_the_exact_one(spread):
     # Where the runs are alike the spread is a funnel's neck; where they differ each is its own.

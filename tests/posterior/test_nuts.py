@@ -49,6 +49,7 @@ def test_a_gaussian_from_a_start_that_is_off():
     within_error(samples, np.zeros(4), sd)
 
 
+@pytest.mark.slow
 def test_the_same_draws_whatever_the_threads():
     problem = gas_spring(relative_sd=0.1, seed=1)
     start = laplace_mixture(LogDensity(problem), np.array([[1.2]]))
@@ -135,6 +136,7 @@ class Failing(GasSpring):
         return found
 
 
+@pytest.mark.slow
 def test_failed_solves_are_counted_by_reason_whatever_the_threads():
     problem = Failing(measured(1), Normal(1.0, 0.1))
     start = laplace_mixture(LogDensity(problem), np.array([[1.22]]))
@@ -167,6 +169,7 @@ def test_modes_apart_are_told():
     assert "a chain has been to 1 of 2 known modes" in samples.warning
 
 
+@pytest.mark.slow
 def test_only_a_complete_run_is_kept(tmp_path):
     sd = np.ones(2)
     calls = Counter()

@@ -66,6 +66,7 @@ def ready(shared, phi):
     return shared
 
 
+@pytest.mark.slow
 def test_rows_are_the_same_to_the_last_bit(fit, eager):
     phi = near(fit, far=3)
     alone = density_of(fit, 1)
@@ -106,6 +107,7 @@ def test_a_lost_process_costs_nothing_but_time(fit, eager, known):
     processes._in_use.release()
 
 
+@pytest.mark.slow
 def test_draws_do_not_depend_on_processes(fit, eager, monkeypatch):
     density = density_of(fit)
     start = laplace_mixture(density, fit.point.theta[None])

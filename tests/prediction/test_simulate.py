@@ -74,6 +74,7 @@ def test_a_motion_is_its_cosines():
     np.testing.assert_allclose(item.evaluate(phase, 3.0), expected, atol=1e-14)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=10)
 @given(phase=st.floats(-2.0, 2.0), per_period=st.floats(40.0, 90.0))
 def test_a_refit_returns_the_parameters(phase, per_period):

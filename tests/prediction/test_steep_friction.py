@@ -32,6 +32,7 @@ LIGHT = 0.01
 PLAN = RunPlan("a", 0.2, {"force": motion(0.0, [2.0])})
 
 
+@pytest.mark.slow
 def test_every_mass_is_solved_and_agrees_with_shooting() -> None:
     masses, phases = {"mass": np.logspace(0, -3, 13)}, np.arange(101) / 101
     # Equal steps see the sticking of a light mass as coarse as they are: a part of 1/512 each. The

@@ -79,6 +79,7 @@ def test_the_page_makes_its_case(page):
         assert text in page, text
 
 
+@pytest.mark.slow
 def test_the_page_begins_with_the_case(page):
     assert page.index("Was anything wrong?") < page.index("Data and noise</h2>")
 

@@ -109,6 +109,7 @@ def test_a_search_begins_with_the_estimate_that_was_made(
         assert own[key] == other[key]
 
 
+@pytest.mark.slow
 def test_another_method_leads_to_the_same_mode(problem: bo.Problem, fit: bo.Fit) -> None:
     other = problem.fit(method="levenberg-marquardt")
     np.testing.assert_allclose(other.parameters["estimate"], fit.parameters["estimate"], rtol=1e-6)

@@ -20,6 +20,7 @@ def plain(campaign: bo.Campaign) -> bo.Fit:
     return bo.Problem(campaign, damper(cubic=False), **settings).fit()
 
 
+@pytest.mark.slow
 def test_a_campaign_is_sampled_by_either(plain: bo.Fit) -> None:
     by_nuts, by_walkers = (plain.sample(seed=3, sampler=s) for s in ("nuts", "ensemble"))
     check_shown(by_nuts, "4 chains of")

@@ -41,6 +41,7 @@ def end_stop(theta, **options):
     return adaptive_orbit(system("end_stop"), END_STOP, values, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["radau2", "radau3", "gauss2", "gauss3"])
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-6])
 @pytest.mark.parametrize(

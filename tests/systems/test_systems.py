@@ -17,6 +17,7 @@ from bayesoleo.systems import describe, system, systems
 DIMENSIONLESS = ("van_der_pol", "lorenz", "rossler")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", systems())
 def test_description_is_json_and_its_formulas_render(name):
     listed = json.loads(json.dumps(describe(system(name)), allow_nan=False))

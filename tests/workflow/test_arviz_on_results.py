@@ -61,6 +61,7 @@ def correlated(campaign):
     return sampled(campaign, error_model="correlated")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", PLOTS)
 def test_a_plot_of_arviz_works_on_the_result(name, tree, correlated):

@@ -218,6 +218,7 @@ def test_results_depend_neither_on_threads_nor_on_the_folder(closed, campaign):
     assert one == two
 
 
+@pytest.mark.slow
 def test_another_seed_draws_other_samples_of_the_same_posterior(closed, campaign):
     tree, _ = closed
     other = workflow.sample(
@@ -253,6 +254,7 @@ def test_estimate_and_sample_give_the_groups_they_promise(campaign, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_trace_ranks_and_adds_nothing(campaign, tmp_path):
     tree = workflow.trace(campaign, MODEL, SETTINGS, out=tmp_path)
     summary = json.loads(tree.attrs[schema.SUMMARY])

@@ -131,6 +131,7 @@ def test_a_new_transient_is_foreseen_to_its_noise(tmp_path, kind):
     np.testing.assert_allclose(found["coverage"], 0.95, atol=0.025)
 
 
+@pytest.mark.slow
 def test_starts_that_noise_leaves_open_are_drawn(tmp_path):
     """The band at the first sample, where only the start counts, against least squares."""
     campaign = reduced(tmp_path, "lag")
@@ -144,6 +145,7 @@ def test_starts_that_noise_leaves_open_are_drawn(tmp_path):
     assert half == pytest.approx(1.959964 * np.sqrt(variance), rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_result_of_periodic_runs_has_no_starts_and_needs_none(tmp_path):
     """Of two masses one is not seen: neither its place nor its rate are in any record."""
     campaign = reduced(tmp_path, "two")

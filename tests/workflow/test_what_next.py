@@ -46,6 +46,7 @@ def test_the_group_holds_every_run_with_its_place(proposed):
     assert best == np.nanmax(group["information"].values)
 
 
+@pytest.mark.slow
 def test_summary_and_group_agree(proposed):
     (entry,) = json.loads(proposed.attrs[schema.SUMMARY])["proposals"]
     group = proposed[schema.PROPOSAL].to_dataset().isel(round=0)
