@@ -447,11 +447,11 @@ DISCOVERY: Rows = {
         ("errors that are fast beside averages are lost",
          "if beyond > averaged**2 - self.noise**2:",
          "if False:",
-         "discovery/test_errors_of_transients.py"),
+         "discovery/test_errors_of_transients.py::test_errors_of_hundreds_of_swings_are_seen"),
         ("what noise feigns in single samples is an error",
          "beyond = self.rms**2 - self.sigma**2 - self.feigned",
          "beyond = self.rms**2 - self.sigma**2",
-         "discovery/test_errors_of_transients.py"),
+         "discovery/test_errors_of_transients.py::test_noise_has_no_excess"),
     ],
     "discovery/_expected_information.py": [
         ("the root of noise and spread without the noise",

@@ -34,6 +34,7 @@ from functools import partial
 from importlib import import_module
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 from mutant_table import MUTANTS, Mutant
 
@@ -47,13 +48,15 @@ LIBRARIES = (
 #: Of pytest: what serves reports only takes longer than most tests.
 SETTINGS = (
     "-x", "-q", "-n", "0", "--assert=plain", "--tb=line", "-p", "no:cacheprovider",
-    "-p", "no:unraisableexception", "-p", "no:threadexception",
+    "-p", "no:unraisableexception", "-p", "no:threadexception", "-m", "",
 )  # fmt: skip
 #: Seconds of computing time that the tests of one mutant may take, and those of all without one;
 #: and how often they may be waited for as long, on a machine with other work.
 COMPUTING, ALL_COMPUTING, PATIENCE = 300, 3000, 10
 #: Of the mutants, every so many are a sample.
 SPARSE = 9
+#: Marks of tests that are run only where a mutant names them.
+SLOW = ("slow", "statistical")
 #: How pytest ends: all passed; some failed; interrupted by an error of a module.
 PASSED, NOTICED = 0, (1, 2)
 
@@ -86,6 +89,28 @@ def mutated(mutant: Mutant, source: str) -> str:
 def is_compiled(source: str) -> bool:
     """Whether Numba compiles functions of a file."""
     return any(line.startswith(("@jit", "@inner")) for line in source.splitlines())
+
+
+class WithoutSlow:
+    """Of files whole, pytest runs the quick tests; a slow one where it is named itself.
+
+    Parameters
+    ----------
+    chosen : sequence of str
+        Files and tests.
+    """
+
+    def __init__(self, chosen: Sequence[str]) -> None:
+        self._named = {name.partition("::")[2] for name in chosen} - {""}
+
+    def pytest_collection_modifyitems(self, items: list[Any]) -> None:
+        """Leave out what takes long."""
+        items[:] = [
+            item
+            for item in items
+            if item.nodeid.partition("::")[2].partition("[")[0] in self._named
+            or not any(item.get_closest_marker(mark) for mark in SLOW)
+        ]
 
 
 class Copy:
@@ -173,7 +198,8 @@ class Copy:
             sys.dont_write_bytecode = True  # of a mutant
             import pytest
 
-            status = int(pytest.main([*SETTINGS, *(f"tests/{name}" for name in tests)]))
+            chosen = [f"tests/{name}" for name in tests]
+            status = int(pytest.main([*SETTINGS, *chosen], [WithoutSlow(chosen)]))
             here = str(sys.modules["bayesoleo"].__file__)
             status = status if here.startswith(str(self.root)) else 4
         except BaseException:
