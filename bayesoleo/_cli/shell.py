@@ -197,13 +197,14 @@ _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.
 _NO_ROOM = ("failed to map segment", "cannot allocate memory", "cannot map zero-fill")
 
 
-#: Bytes of address space that the numerical libraries take before any work; measured, 0.86 GB.
-LIBRARIES = 900 * 2**20
+#: Bytes of address space that the numerical libraries take before any work, and that their compiler
+#: and their linear algebra take with it; measured, 0.86 GB and 0.25 GB.
+LIBRARIES, TOOLS = 900 * 2**20, 256 * 2**20
 
 
 def check_address_space() -> None:
     """Raise where a limit leaves no room for the libraries: some of them end the process when they
-    meet it, and say nothing that a user can act on.
+    meet it, at their first work too, and say nothing that a user can act on.
 
     Raises
     ------
@@ -215,11 +216,27 @@ def check_address_space() -> None:
     except ImportError:  # a system without such limits
         return
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if limit != resource.RLIM_INFINITY and limit < LIBRARIES:
+    if limit == resource.RLIM_INFINITY:
+        return
+    set_to = f"a limit of {limit / 2**20:.0f} MB is set (ulimit -v)"
+    if limit < LIBRARIES + TOOLS:
+        needed = (LIBRARIES + TOOLS) / 2**20
+        raise MemoryError(f"{set_to}, and the libraries alone need {needed:.0f} MB")
+    taken = _address_space()
+    if limit - taken < TOOLS:
         raise MemoryError(
-            f"a limit of {limit / 2**20:.0f} MB is set (ulimit -v), and the libraries alone need"
-            f" {LIBRARIES / 2**20:.0f} MB"
+            f"{set_to}, of which {taken / 2**20:.0f} MB are taken, and linear algebra alone needs"
+            f" {TOOLS / 2**20:.0f} MB more"
         )
+
+
+def _address_space() -> int:
+    """Bytes of address space that this process has; zero where the system does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        return pages * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError):
+        return 0
 
 
 def machine_text(error: MemoryError | OSError | ImportError) -> str:

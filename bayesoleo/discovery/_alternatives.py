@@ -109,6 +109,8 @@ def eliminated(
     numerics: Numerics,
     notes: list[str],
     callback: ProgressCallback,
+    *,
+    last_too: bool = False,
 ) -> State:
     """The state without effects that are not worth their unknowns.
 
@@ -130,8 +132,10 @@ def eliminated(
         Receives the removed effects with the reasons.
     callback : callable
         Receives a message at each step.
+    last_too : bool
+        Test the last one as the others: it was found to be needed in another form of the model.
     """
-    last = state.assembly.steps[-1:]
+    last = () if last_too else state.assembly.steps[-1:]
     while state.assembly.steps:
         base = state.base()
         doubted = [

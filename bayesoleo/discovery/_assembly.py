@@ -315,13 +315,24 @@ class Assembly:
         An effect acts on what another brought if it sits there, as a parameter that varies by run
         does, or follows it, as a curve follows the memory of a friction law.
         """
-        return self._anew([other for other in self.steps if other is not step], self.corner)
+        left = self._anew([other for other in self.steps if other is not step], self.corner)
+        # Without the friction that had it nothing speaks for the corner.
+        return left if left.has_corner else replace(left, corner=ARCTANGENT)
+
+    @property
+    def cornered(self) -> list[str]:
+        """Titles of dry friction that was added whose corner the declared model does not state."""
+        declared = self.declared or self.native
+        return [step.effect.title for step in self.steps if has_corner(step.effect, declared)]
 
     @property
     def has_corner(self) -> bool:
-        """Whether dry friction was added whose corner the declared model does not state."""
-        declared = self.declared or self.native
-        return any(has_corner(step.effect, declared) for step in self.steps)
+        """Whether there is such dry friction."""
+        return bool(self.cornered)
+
+    def fits(self, corner: str) -> bool:
+        """Whether its dry friction, if there is any, has a corner."""
+        return self.corner == corner or not self.has_corner
 
     @property
     def ends_in_corner(self) -> bool:

@@ -6,11 +6,14 @@ model then. Those that come later may change which one that is.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from bayesoleo._types import ProgressCallback
-from bayesoleo.discovery._assembly import Roles
+from bayesoleo.discovery._assembly import Assembly, Roles
 from bayesoleo.discovery._numerics import Numerics
+from bayesoleo.discovery._ranking import Ranked
 from bayesoleo.discovery._refit import (
     clearly_better,
     compare,
@@ -61,29 +64,32 @@ def cornered(state: State, roles: Roles, numerics: Numerics, callback: ProgressC
     return other
 
 
-def scored_with(state: State, scores: list[Score], corner: str, jobs: int | None) -> list[Score]:
-    """Scores about a model, those of dry friction with another corner than they were made with.
+def beginning(
+    first: State, ranking: Sequence[Ranked], corner: str, jobs: int | None
+) -> tuple[Assembly, list[Score]]:
+    """The declared model and the scores of its candidates with a corner of dry friction.
 
     Parameters
     ----------
-    state : State
+    first : State
         The model.
-    scores : list of Score
-        Of its candidates.
+    ranking : sequence of Ranked
+        Its candidates, as they were scored.
     corner : str
+        Dry friction that was scored with another one is scored again.
     jobs : int or None
         Processes.
     """
-    assembly = state.assembly
-    if corner == assembly.corner:
-        return scores
-    steps = {score.option.key: score.option.assembly.steps[-1] for score in scores}
+    scores, assembly = [item.score for item in ranking], first.assembly
     turned = assembly.with_corner(corner)
+    if corner == assembly.corner:
+        return turned, scores
+    steps = {score.option.key: score.option.assembly.steps[-1] for score in scores}
     options = [
         turned.option(step.effect, step.target, step.scales)
         for step in steps.values()
         if has_corner(step.effect, assembly.native)
     ]
-    found, _ = score_all(state.base(), options, jobs)
+    found, _ = score_all(first.base(), options, jobs)
     again = {score.option.key: score for score in found}
-    return [again.get(score.option.key, score) for score in scores]
+    return turned, [again.get(score.option.key, score) for score in scores]

@@ -22,7 +22,7 @@ from bayesoleo._parallel import single_blas_thread
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._alternatives import best_of_beam, eliminated
 from bayesoleo.discovery._assembly import Added, Assembly, Roles
-from bayesoleo.discovery._corners import cornered, scored_with
+from bayesoleo.discovery._corners import beginning, cornered
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._fit_and_hold_out_error import RunError, least_noise, limit
 from bayesoleo.discovery._judged_together import TOGETHER, judged_together
@@ -66,7 +66,7 @@ ON_LIMIT = "at the limit of their prior's support"
 #: Beginning of the note on a declared model that was estimated from another start than its own.
 OTHER_OPTIMUM = "the estimate from the declared values ended in a local optimum, lower"
 #: Beginning of the note on the corner of dry friction, where it is not the usual one.
-OTHER_CORNER = "in the dry friction that was added the sign of the velocity v is"
+OTHER_CORNER = "the sign of the velocity v is not that of the catalogue"
 #: Beginning of the note on parameters whose sign is not the declared one.
 OTHER_SIGN = "opposite in sign to the declared value"
 
@@ -406,15 +406,17 @@ def probabilities(
     callback("compare structures")
     items = [item for entry in progress.rounds for item in entry.ranking]
     refits = [one for item in items for one in (item.refit, item.beside) if one is not None]
-    known = [(one.assembly, one.fit) for one in refits if np.isfinite(one.share)]
+    refits = [one for one in refits if np.isfinite(one.share)]
+    corner = final.assembly.corner
+    known = [(one.assembly, one.fit) for one in refits if one.assembly.fits(corner)]
     known += [(final.assembly, final.fit)] if final.assembly.steps else []
     # The noise is that which the best model has left.
     errors = {(entry.run, entry.output): entry for entry in final.fit_errors.entries}
-    corner = final.assembly.corner
+    assembly, scores = beginning(first, ranking, corner, numerics.jobs)
     return structure_posterior(
         first.base(),
-        first.assembly.with_corner(corner),
-        scored_with(first, [item.score for item in ranking], corner, numerics.jobs),
+        assembly,
+        scores,
         errors,
         numerics,
         prior=prior,
@@ -529,14 +531,32 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
             )
         if outcome.after is not None:
             notes = [note for note in notes if not note.startswith(TOGETHER)]
-            state = eliminated(outcome.after, state, roles, numerics, notes, callback)
-            state = cornered(state, roles, numerics, callback)
+            before, state = state, outcome.after
+            state = eliminated(state, before, roles, numerics, notes, callback)
+            state = _in_corner(state, before, roles, numerics, notes, callback)
             noise = least_noise(roles.measured, state.errors.record_noise)
             roles = replace(roles, measured=noise)
         known = known.after(outcome, state, notes)
         if not _went_no_further(known):  # a longer search goes on with what was on trial
             search.keep(known)
     return known
+
+
+def _in_corner(
+    state: State,
+    before: State,
+    roles: Roles,
+    numerics: Numerics,
+    notes: list[str],
+    callback: ProgressCallback,
+) -> State:
+    """The state with the corner of dry friction that is likeliest, and no effect that only made up
+    for another one."""
+    turned = cornered(state, roles, numerics, callback)
+    while turned is not state:
+        state = eliminated(turned, before, roles, numerics, notes, callback, last_too=True)
+        turned = cornered(state, roles, numerics, callback)
+    return state
 
 
 def _looked_at(ahead: tuple[Round, Roles] | None, state: State, roles: Roles) -> Round | None:
@@ -603,8 +623,8 @@ def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:
     notes += nonparametric_notes(progress.rounds)
     if state.assembly.has_corner and state.assembly.corner != ARCTANGENT:
         notes.append(
-            f"{OTHER_CORNER} {state.assembly.corner}, with half the friction at v0: it left"
-            f" less than {ARCTANGENT}"
+            f"{OTHER_CORNER} in {', '.join(state.assembly.cornered)}: {state.assembly.corner}, with"
+            f" half the friction at v0; {ARCTANGENT} was not clearly likelier"
         )
     notes += [f"could not be predicted: run {text}" for text in state.unsolved]
     notes += state.too_quiet

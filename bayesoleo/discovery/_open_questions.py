@@ -18,6 +18,7 @@ from bayesoleo import _schema as schema
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import Added
+from bayesoleo.discovery._corners import beginning
 from bayesoleo.discovery._fit_and_hold_out_error import ErrorTable, error_table
 from bayesoleo.discovery._loop import SURE, ClosedLoop, scored_later
 from bayesoleo.discovery._next_experiment import (
@@ -287,10 +288,11 @@ def _of_structures(
     number = len(loop.rounds)
     plan.callback(f"look for a run that distinguishes {number_of(len(names), 'structure')}")
     try:
-        first = loop.first
-        scores = [item.score for item in loop.rounds[0].ranking]
+        first, corner = loop.first, loop.final.assembly.corner
+        ranking, jobs = loop.rounds[0].ranking, plan.numerics.jobs
+        assembly, scores = beginning(first, ranking, corner, jobs)
         scores += scored_later(loop.rounds)
-        fits = structure_fits(first.base(), first.assembly, scores, chosen, plan.numerics)
+        fits = structure_fits(first.base(), assembly, scores, chosen, plan.numerics)
         rivals, failed = [], []
         for effects, name, found in zip(chosen, names, fits, strict=True):
             if found is not None and np.isfinite(found.fit.point.covariance).all():

@@ -55,12 +55,14 @@ from bayesoleo.model._parameters import Coordinate, Dof
 #: Corners of dry friction at zero velocity, as a reader sees them.
 ARCTANGENT, HYPERBOLIC = "2/pi*atan(v/v0)", "tanh(log(3)/2*v/v0)"
 ALGEBRAIC, SATURATION = "v/sqrt(v**2 + 3*v0**2)", "max(-1, min(v/v0/2, 1))"
+RATIONAL = "v/(abs(v) + v0)"
 #: Smooth signs by corner, over the velocity at which they are one half; the first is the usual one.
 _SIGNS: dict[str, Callable[[sp.Expr], sp.Expr]] = {
     ARCTANGENT: lambda ratio: 2 / sp.pi * sp.atan(ratio),
     HYPERBOLIC: lambda ratio: sp.tanh(sp.log(3) / 2 * ratio),
     ALGEBRAIC: lambda ratio: ratio / sp.sqrt(ratio**2 + 3),
     SATURATION: lambda ratio: (sp.Abs(ratio + 2) - sp.Abs(ratio - 2)) / 4,
+    RATIONAL: lambda ratio: ratio / (sp.Abs(ratio) + 1),
 }
 CORNERS = tuple(_SIGNS)
 #: The same as formulas.
@@ -69,6 +71,7 @@ _FORMULAS = {
     HYPERBOLIC: r"\tanh(\frac{\ln 3}{2} \dot q / v_0)",
     ALGEBRAIC: r"\dot q / \sqrt{\dot q^2 + 3 v_0^2}",
     SATURATION: r"\operatorname{clip}(\dot q / 2 v_0, -1, 1)",
+    RATIONAL: r"\dot q / (|\dot q| + v_0)",
 }
 
 #: A model's own friction slope, in s/m: effects that need a smooth sign use it where it exists.
@@ -411,7 +414,7 @@ def with_corner(effect: Effect, corner: str) -> Effect:
         One of :data:`CORNERS`.
     """
     term = effect.change
-    if not isinstance(term, AddedTerm) or term.corner == corner:
+    if not isinstance(term, AddedTerm) or term.corner == corner or "direction" not in term.used():
         return effect
     formula = effect.formula.replace(_FORMULAS[term.corner], _FORMULAS[corner])
     return replace(effect, change=replace(term, corner=corner), formula=formula)

@@ -116,8 +116,23 @@ def test_a_library_without_room_before_a_command_begins_is_named(monkeypatch, ca
 
 def test_no_limit_or_a_large_one_is_no_error(monkeypatch):
     resource = pytest.importorskip("resource")
-    for limit in (resource.RLIM_INFINITY, 2 * shell.LIBRARIES):
+    needed = shell.LIBRARIES + shell.TOOLS
+    monkeypatch.setattr(shell, "_address_space", lambda: shell.LIBRARIES)
+    for limit in (resource.RLIM_INFINITY, needed):
         monkeypatch.setattr(resource, "getrlimit", lambda _, limit=limit: (limit, limit))
+        shell.check_address_space()
+
+
+def test_a_limit_that_leaves_the_tools_no_room_is_named(monkeypatch):
+    """Compiler and linear algebra end the process where they get no memory, and say nothing."""
+    resource = pytest.importorskip("resource")
+    needed = shell.LIBRARIES + shell.TOOLS
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (needed - 1, needed - 1))
+    with pytest.raises(MemoryError, match="libraries alone need 1156 MB"):
+        shell.check_address_space()
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (needed, needed))
+    monkeypatch.setattr(shell, "_address_space", lambda: shell.LIBRARIES + 1)
+    with pytest.raises(MemoryError, match=r"900 MB are taken, .* needs 256 MB more"):
         shell.check_address_space()
 
 

@@ -13,21 +13,24 @@ from fitted_states import NUMERICS, fitted, options, scored
 from small_campaigns import damper, damper_campaign, oscillator_campaign, spring_damper_force
 from test_velocities import motor, motor_campaign, oscillator
 
-from bayesoleo.discovery import _corners as corners, _refit as refits
+from bayesoleo.discovery import _corners as corners, _loop as loop_module, _refit as refits
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._corners import cornered, scored_with
+from bayesoleo.discovery._corners import beginning, cornered
 from bayesoleo.discovery._loop import OTHER_CORNER, Progress, close_loop
 from bayesoleo.discovery._refit import clearly_better, refit
 from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._state import State, fit_state
-from bayesoleo.effects import find_effect
+from bayesoleo.effects import find_effect, force_effect
 from bayesoleo.effects._forces import (
     ALGEBRAIC,
     ARCTANGENT,
     HYPERBOLIC,
+    RATIONAL,
     SATURATION,
     smooth_sign,
+    with_corner,
 )
+from bayesoleo.effects._parts import ShapeParameter, velocity_grid
 from bayesoleo.model._expressions import symbol
 
 FRICTION, AT = 5.0, 0.01
@@ -146,14 +149,15 @@ def test_a_corner_can_be_changed_and_changed_back(sharp):
     assert back.native.output_terms("force") == usual.native.output_terms("force")
 
 
-@pytest.mark.parametrize("corner", [ALGEBRAIC, SATURATION])
+@pytest.mark.parametrize("corner", [ALGEBRAIC, SATURATION, RATIONAL])
 def test_every_corner_is_tried_where_most_is_explained(tmp_path, monkeypatch, corner):
     state = fitted(damper_campaign(tmp_path, rubbing_with(corner), noise=0.02), damper())
     tried = counted(monkeypatch)
     found = refit(state.base(), score_of(state), NUMERICS)
     assert found.assembly.corner == corner
     assert found.reached
-    assert tried == [HYPERBOLIC, ALGEBRAIC, SATURATION][: 2 if corner == ALGEBRAIC else 3]
+    order = [HYPERBOLIC, ALGEBRAIC, SATURATION, RATIONAL]
+    assert tried == order[: order.index(corner) + 1]
     # One where what is left may be another effect.
     tried.clear()
     base = replace(state.base(), policy=replace(NUMERICS.policy, explained=1.1))
@@ -161,7 +165,7 @@ def test_every_corner_is_tried_where_most_is_explained(tmp_path, monkeypatch, co
     assert tried == [HYPERBOLIC]
 
 
-@pytest.mark.parametrize("corner", [ARCTANGENT, ALGEBRAIC, SATURATION])
+@pytest.mark.parametrize("corner", [ARCTANGENT, ALGEBRAIC, SATURATION, RATIONAL])
 def test_every_corner_is_tried_where_the_effect_was_chosen(tmp_path, corner):
     """What an estimate does not try is found once its effect is in the model."""
     state = fitted(damper_campaign(tmp_path, rubbing_with(corner), noise=0.02), damper())
@@ -170,6 +174,45 @@ def test_every_corner_is_tried_where_the_effect_was_chosen(tmp_path, corner):
     assert found.at_floor
     k = found.fit.problem.names.index("coulomb_friction_transition")
     assert abs(found.fit.point.theta[k] - AT) < 4 * found.fit.point.sd[k] < 0.02 * AT
+
+
+def test_all_effects_are_tested_again_with_another_corner(monkeypatch):
+    """An effect may have made up for the corner that the model had; it goes with it."""
+    states, told = ["round", "needed", "turned", "without"], []
+
+    def eliminated(state, before, *_, last_too=False):
+        told.append((state, before, last_too))
+        return states[states.index(state) + 1]
+
+    monkeypatch.setattr(loop_module, "eliminated", eliminated)
+    monkeypatch.setattr(
+        loop_module, "cornered", lambda state, *_: "turned" if state == "needed" else state
+    )
+    found = loop_module._in_corner("needed", "before", None, NUMERICS, [], silent)
+    assert found == "without"
+    assert told == [("turned", "before", True)]
+
+
+def test_a_corner_goes_with_its_friction(sharp):
+    tanh = sharp.assembly.with_corner(HYPERBOLIC)
+    scales, steps = score_of(sharp).option.assembly.steps[-1].scales, []
+    for name in ("cubic_stiffness", "coulomb_friction"):
+        tanh = tanh.option(find_effect(name), "force", scales).assembly
+        steps.append(tanh.steps[-1])
+    assert tanh.cornered == ["Coulomb friction"]
+    assert tanh.fits(HYPERBOLIC)
+    assert not tanh.fits(ARCTANGENT)
+    assert tanh.without(steps[0]).corner == HYPERBOLIC
+    assert tanh.without(steps[1]).corner == ARCTANGENT
+    assert tanh.without(steps[1]).fits(HYPERBOLIC), "what has no dry friction fits any"
+
+
+def test_a_formula_of_a_user_stays_as_it_is():
+    own = "own*2/pi*atan(velocity/v0)"
+    formula = r"k \frac{2}{\pi} \arctan(\dot q / v_0)"
+    shape = ShapeParameter("v0", "position/s", "v_0", "velocity", velocity_grid(1 / 512, 1 / 4))
+    mine = force_effect("mine", "friction", own, {"own": "force"}, shapes=(shape,), formula=formula)
+    assert with_corner(mine, HYPERBOLIC) is mine
 
 
 def test_no_corner_is_taken_that_other_runs_contradict(tmp_path, monkeypatch):
@@ -213,8 +256,12 @@ def test_the_corner_is_looked_at_again_when_another_effect_was_added(tmp_path):
 
 def test_structures_are_scored_with_the_corner_that_was_found(sharp):
     both = list(scored(sharp, "coulomb_friction", "cubic_stiffness", "quintic_stiffness").values())
-    assert scored_with(sharp, both, ARCTANGENT, 1) is both
-    found = scored_with(sharp, both, HYPERBOLIC, 1)
+    ranking = [SimpleNamespace(score=score) for score in both]
+    usual, same = beginning(sharp, ranking, ARCTANGENT, 1)
+    assert usual.corner == ARCTANGENT
+    assert all(one is other for one, other in zip(same, both, strict=True))
+    turned, found = beginning(sharp, ranking, HYPERBOLIC, 1)
+    assert turned.corner == HYPERBOLIC
     for old, new in zip(both, found, strict=True):
         assert new.option.key == old.option.key
         rubs = old.option.key[0] == "coulomb_friction"
