@@ -115,6 +115,7 @@ def test_other_signals_have_no_levels(kind):
     assert scatter_about_levels(OTHERS[kind](rng) + NOISE * rng.standard_normal(SIZE)) == np.inf
 
 
+@pytest.mark.slow
 def test_noise_of_a_held_channel_in_a_record(tmp_path):
     """Switched at leisure, switched at every sample, and a command of any value at every sample."""
     rng, size = np.random.default_rng(3), 1000
@@ -159,6 +160,7 @@ def circuit(seed, size=3000):
     return SimulatedRun(str(seed), STEP * np.arange(size), samples, None, kind="transient")
 
 
+@pytest.mark.slow
 def test_noise_of_a_switched_input_is_expected_at_the_output(tmp_path):
     """A right model was said to lack something: it answers to the noise of its measured input."""
     channels = {"u": ("u", "V"), "uc": ("uc", "V")}

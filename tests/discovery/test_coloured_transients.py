@@ -97,6 +97,7 @@ def test_white_noise_is_said_to_be_white():
     assert "the noise is white, and no more than noise is left" in found.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("colour", ["white", "slow"])
 @pytest.mark.parametrize(("kind", "cubic"), [("oscillator", 2e5), ("lag", 0.3)])
 def test_a_missing_effect_is_not_excused_as_coloured_noise(kind, cubic, colour):

@@ -26,11 +26,14 @@ def asked(monkeypatch, drag, stop):
         raise ModelError("not solved here", hint="none")
 
     monkeypatch.setattr(questions, "structure_fits", refused)
-    first = SimpleNamespace(base=lambda: None, assembly=None)
-    loop = SimpleNamespace(certain=False, rounds=[SimpleNamespace(ranking=[])], first=first)
+    assembly = SimpleNamespace(corner="", with_corner=lambda corner: None)
+    first = SimpleNamespace(base=lambda: None, assembly=assembly)
+    loop = SimpleNamespace(
+        certain=False, rounds=[SimpleNamespace(ranking=[])], first=first, final=first
+    )
     monkeypatch.setattr(questions, "scored_later", lambda _: [])
     policy = SimpleNamespace(proposal_rivals=4)
-    plan = SimpleNamespace(numerics=SimpleNamespace(policy=policy), callback=lambda _: None)
+    plan = SimpleNamespace(numerics=SimpleNamespace(policy=policy, jobs=1), callback=lambda _: None)
     return questions._of_structures(loop, structures, plan)
 
 

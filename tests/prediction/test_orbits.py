@@ -64,6 +64,7 @@ def exact():
 OWN = SOLVERS[:-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [*OWN, pytest.param("library", marks=pytest.mark.slow)])
 def test_all_ways_agree_with_another_code_in_motion_and_derivatives(method, exact):
     """Three parameter vectors at once."""
