@@ -198,7 +198,8 @@ _NO_ROOM = ("failed to map segment", "cannot allocate memory", "cannot map zero-
 
 
 #: Bytes of address space that the numerical libraries take before any work, and that their compiler
-#: and their linear algebra take with it; measured, 0.86 GB and 0.25 GB.
+#: and their linear algebra take with it. On two cores the first was 0.86 GB; with 1.05 GB in all
+#: linear algebra ended the process, with 1.16 GB an estimate of fourteen runs ended well.
 LIBRARIES, TOOLS = 900 * 2**20, 256 * 2**20
 
 

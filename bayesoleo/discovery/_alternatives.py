@@ -42,7 +42,6 @@ from bayesoleo.discovery._refit import (
     Refit,
     colour_of,
     compare,
-    dispersion,
     fall_from,
     inflation_along,
     quick_fit,
@@ -221,6 +220,14 @@ def loss_of(base: Base, step: AddedEffect, fit: ModelFit) -> Loss:
     # The logarithm is that of the effective number of independent samples.
     price = max(schwarz_price(base) - float(np.log(noise.on_trial)), 1.0)
     return Loss(step, -share * base.fall_back, len(names), price, noise)
+
+
+def dispersion(base: Base) -> float:
+    """Mean square of the residual of periodic runs over that of the noise, at least one. For
+    transients it is one, because their inflation holds it."""
+    if not base.fit.all_periodic or not base.excess > base.feigned:
+        return 1.0
+    return 1.0 + base.excess / max(base.noise, 1e-300)
 
 
 def leads_as_far(

@@ -334,11 +334,6 @@ class Assembly:
         """Whether its dry friction, if there is any, has a corner."""
         return self.corner == corner or not self.has_corner
 
-    @property
-    def ends_in_corner(self) -> bool:
-        """Whether the last effect is such dry friction."""
-        return bool(self.steps) and replace(self, steps=self.steps[-1:]).has_corner
-
     def with_corner(self, corner: str) -> Assembly:
         """The same effects with another corner of dry friction, and the same parameters."""
         return self._anew(self.steps, corner) if self.steps else replace(self, corner=corner)

@@ -22,14 +22,7 @@ from bayesoleo.discovery._assembly import Assembly, Roles
 from bayesoleo.discovery._fit import fit_model
 from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._ranking import ABSORBING_FAMILIES, Ranked, score_candidates
-from bayesoleo.discovery._refit import (
-    Refit,
-    new_parameters,
-    quick_fit,
-    refit_all,
-    refit_at,
-    with_better_corner,
-)
+from bayesoleo.discovery._refit import Refit, new_parameters, quick_fit, refit_all, refit_at
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._state import State, state_of
@@ -151,8 +144,7 @@ def refit_from(base: Base, score: Score, values: Mapping[str, float], numerics: 
     assembly = score.option.assembly.with_values(base.fit.shared)
     assembly = assembly.with_parameters(new_parameters(assembly, likely, base.policy))
     fit = quick_fit(base, assembly.model(), {**base.fit.values, **values}, numerics)
-    found = with_better_corner(base, refit_at(base, likely, assembly, fit), numerics)
-    return replace(found, score=score)
+    return replace(refit_at(base, likely, assembly, fit), score=score)
 
 
 def with_suggestions(

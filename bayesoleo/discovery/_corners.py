@@ -1,7 +1,11 @@
-"""Corner of dry friction at zero velocity, once other effects are in the model.
+"""Corner of dry friction at zero velocity.
 
-An effect of friction is estimated with the corner that fits best beside the effects that are in the
-model then. Those that come later may change which one that is.
+The catalogue's is the arctangent of Verbeek (1993). It comes with tails: at ten transition
+velocities a fifteenth of the friction is still to come. The corner of measured friction may end
+sooner, and effects that nothing has are then found in the difference.
+
+Candidates are estimated with the corner that the model has. With the best of several corners for
+each, friction of a flexible form explains what two other effects do.
 """
 
 from __future__ import annotations
@@ -12,25 +16,28 @@ import numpy as np
 
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import Assembly, Roles
+from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._ranking import Ranked
-from bayesoleo.discovery._refit import (
-    clearly_better,
-    compare,
-    inflation_along,
-    other_corners,
-    with_other_corner,
-)
+from bayesoleo.discovery._refit import compare, inflation_along, quick_fit
+from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score, score_all
 from bayesoleo.discovery._state import State, fit_state
-from bayesoleo.effects._forces import has_corner
+from bayesoleo.effects._forces import CORNERS, TRANSITION, has_corner
+
+#: Factors of the velocity of a corner from which another corner's estimate may start: an arctangent
+#: makes up for its tails by a smaller one.
+WIDER = (0.5, 4.0, 2.0, 1.0)
 
 
 def cornered(state: State, roles: Roles, numerics: Numerics, callback: ProgressCallback) -> State:
     """The state with the corner of dry friction that makes the data clearly likelier.
 
-    Where more than noise is left, every corner is tried. Where noise is, the tails of an arctangent
-    may still be a part of it that shows in runs which were not fitted, and one other is tried.
+    It is taken only where noise explains all that is left with it. Beside an effect that is missing
+    another corner makes up for a part of that.
+
+    Where noise explains what the present corner leaves, the tails of an arctangent may still be a
+    part of it that shows in runs which were not fitted, and one other is tried.
 
     Parameters
     ----------
@@ -50,18 +57,35 @@ def cornered(state: State, roles: Roles, numerics: Numerics, callback: ProgressC
     for corner in others:
         assembly, fit = with_other_corner(base, state.assembly, state.fit, corner, numerics)
         share, changes = compare(base, fit)
-        noise = inflation_along(base, fit, names, changes)
-        fall = share * base.fall_back
-        if noise is not None and clearly_better(base, best, fall, noise.value):
+        fall, noise = share * base.fall_back, inflation_along(base, fit, names, changes)
+        reached = base.excess - fall < base.feigned
+        # Two forms with as many unknowns are told apart as two effects are.
+        if reached and noise and fall - best > base.policy.equal_likelihood * noise.value:
             found, best = (assembly, fit), fall
     if found is None:
         return state
     assembly, fit = found
     other = fit_state(assembly.with_values(fit.shared), roles, numerics, start=fit.point.theta)
-    if np.isnan(other.worst_ratio) or (state.at_floor and not other.at_floor):
-        return state  # runs that were not fitted speak against it
+    if np.isnan(other.worst_ratio) or not other.at_floor:
+        return state  # finer steps, or runs that were not fitted, speak against it
     callback(f"take {assembly.corner} for the sign of the velocity in dry friction")
     return other
+
+
+def other_corners(corner: str) -> list[str]:
+    """Corners of dry friction that are tried where a model has another one, in this order."""
+    return [other for other in CORNERS if other != corner]
+
+
+def with_other_corner(
+    base: Base, assembly: Assembly, fit: ModelFit, corner: str, numerics: Numerics
+) -> tuple[Assembly, ModelFit]:
+    """A model with another corner of dry friction, and its estimate from the present one."""
+    present = assembly.model().parameters
+    widths = [name for name in fit.shared if present[name].description == TRANSITION]
+    starts = [fit.values | {name: factor * fit.shared[name] for name in widths} for factor in WIDER]
+    other = assembly.with_corner(corner)
+    return other, quick_fit(base, other.model(), starts, numerics)
 
 
 def beginning(

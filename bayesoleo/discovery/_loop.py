@@ -39,7 +39,7 @@ from bayesoleo.discovery._structure_search import DEFAULT_PRIOR, structure_poste
 from bayesoleo.discovery._structures import StructurePosterior, StructurePrior
 from bayesoleo.discovery._work import ENDED, ENDS, work_of
 from bayesoleo.effects._effect import Effect
-from bayesoleo.effects._forces import ARCTANGENT
+from bayesoleo.effects._forces import ARCTANGENT, CORNERS
 from bayesoleo.effects._nonparametric import FAMILY
 
 #: Families of effects that name no cause.
@@ -552,10 +552,11 @@ def _in_corner(
 ) -> State:
     """The state with the corner of dry friction that is likeliest, and no effect that only made up
     for another one."""
-    turned = cornered(state, roles, numerics, callback)
-    while turned is not state:
-        state = eliminated(turned, before, roles, numerics, notes, callback, last_too=True)
+    for _ in CORNERS:
         turned = cornered(state, roles, numerics, callback)
+        if turned is state:
+            break
+        state = eliminated(turned, before, roles, numerics, notes, callback, last_too=True)
     return state
 
 

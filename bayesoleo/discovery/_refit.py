@@ -23,7 +23,6 @@ from bayesoleo.discovery._samples_that_count import weights
 from bayesoleo.discovery._score_basis import Base, squared_distance
 from bayesoleo.discovery._score_tests import Score, inflation_by_estimate
 from bayesoleo.discovery._transient_variance import RunNoise, coloured_variance
-from bayesoleo.effects._forces import CORNERS, TRANSITION
 from bayesoleo.effects._nonparametric import FAMILY
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Parameter
@@ -34,10 +33,6 @@ from bayesoleo.prediction._records import Record
 
 #: Parts of the values that a score expects, from which an estimate may start.
 STARTS = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 64, 1 / 256, 1 / 2**12, 1 / 2**16)
-
-#: Factors of the velocity of a corner from which another corner's estimate may start: an arctangent
-#: makes up for its tails by a smaller one.
-WIDER = (0.5, 4.0, 2.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -231,7 +226,7 @@ class Refit:
         return bool(stats.chi2.cdf(distance, len(index)) >= 2 * level - 1)
 
 
-def refit(base: Base, score: Score, numerics: Numerics, corner: str | None = None) -> Refit:
+def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
     """Estimate the model extended by a candidate.
 
     Parameters
@@ -242,86 +237,12 @@ def refit(base: Base, score: Score, numerics: Numerics, corner: str | None = Non
         Score, for the starts and the scale of priors.
     numerics : Numerics
         The mesh is the present fit's.
-    corner : str, optional
-        Of dry friction, where it is known; by default another one than the model's may be found.
     """
     assembly = score.option.assembly.with_values(base.fit.shared)
-    if corner not in (None, assembly.corner):
-        assembly = assembly.with_corner(corner)
     assembly = assembly.with_parameters(new_parameters(assembly, score, base.policy))
     model = assembly.model()
     fit = quick_fit(base, model, _starts(base, score, model), numerics)
-    found = refit_at(base, score, assembly, fit)
-    return found if corner is not None else with_better_corner(base, found, numerics)
-
-
-def with_better_corner(base: Base, found: Refit, numerics: Numerics) -> Refit:
-    """An estimate with the corner of dry friction that makes the data clearly likelier.
-
-    The arctangent's corner comes with tails: at ten transition velocities a fifteenth of the
-    friction is still to come. The corner of measured friction may end sooner, and effects that
-    nothing has are then found in the difference. Where noise explains what is left, or next to
-    nothing is explained, no other corner is tried. More than one is where the effect explains most
-    of the excess: what is left may then be due to its corner.
-
-    Parameters
-    ----------
-    base : Base
-        What it was estimated against.
-    found : Refit
-    numerics : Numerics
-    """
-    if not found.assembly.ends_in_corner:
-        return found
-    best, least = found, base.policy.least_share
-    for corner in other_corners(found.assembly.corner):
-        if best.reached or not best.share > least:
-            break
-        assembly, fit = with_other_corner(base, found.assembly, found.fit, corner, numerics)
-        other = refit_at(base, found.score, assembly, fit)
-        if clearly_better(base, best.fall, other.fall, other.inflation):
-            best = other
-        least = base.policy.explained
-    return best
-
-
-def other_corners(corner: str) -> list[str]:
-    """Corners of dry friction that are tried where a model has another one, in this order."""
-    return [other for other in CORNERS if other != corner]
-
-
-def with_other_corner(
-    base: Base, assembly: Assembly, fit: ModelFit, corner: str, numerics: Numerics
-) -> tuple[Assembly, ModelFit]:
-    """A model with another corner of dry friction, and its estimate from the present one."""
-    present = assembly.model().parameters
-    widths = [name for name in fit.shared if present[name].description == TRANSITION]
-    starts = [fit.values | {name: factor * fit.shared[name] for name in widths} for factor in WIDER]
-    other = assembly.with_corner(corner)
-    return other, quick_fit(base, other.model(), starts, numerics)
-
-
-def clearly_better(base: Base, before: float, after: float, inflation: float) -> bool:
-    """Whether a fall of the sum of squares exceeds another one, by as many unknowns, so clearly
-    that another form of the same effect is taken for it.
-
-    The ratio of likelihoods must be that which tells two effects apart, as much larger as what is
-    left exceeds noise. Where more than noise is left, it must also be as large a part of that as a
-    further effect has to explain: the form would else make up for what is missing.
-    """
-    policy, rest = base.policy, replace(base, excess=base.excess - after)
-    if not after - before > policy.equal_likelihood * inflation * dispersion(rest):
-        return False
-    least = policy.fair_share * (max(base.excess - before, 0.0) + base.feigned)
-    return rest.excess < base.feigned or after - before > least
-
-
-def dispersion(base: Base) -> float:
-    """Mean square of the residual of periodic runs over that of the noise, at least one. For
-    transients it is one, because their inflation holds it."""
-    if not base.fit.all_periodic or not base.excess > base.feigned:
-        return 1.0
-    return 1.0 + base.excess / max(base.noise, 1e-300)
+    return refit_at(base, score, assembly, fit)
 
 
 def refit_at(base: Base, score: Score, assembly: Assembly, fit: ModelFit) -> Refit:

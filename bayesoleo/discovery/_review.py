@@ -16,7 +16,7 @@ import numpy as np
 
 from bayesoleo._types import ProgressCallback
 from bayesoleo._worker_processes import process_map
-from bayesoleo.discovery._alternatives import Loss, eliminated, loss_without
+from bayesoleo.discovery._alternatives import Loss, dispersion, eliminated, loss_without
 from bayesoleo.discovery._assembly import AddedEffect, Roles
 from bayesoleo.discovery._fit_difference import undecided
 from bayesoleo.discovery._hold_out_confirmation import (
@@ -36,7 +36,6 @@ from bayesoleo.discovery._ranking import (
 )
 from bayesoleo.discovery._refit import (
     Refit,
-    dispersion,
     fall_from,
     new_parameters,
     quick_fit,
@@ -328,22 +327,18 @@ def _from_other_shapes(
         for score in chosen
         if score.shapes and refits[id(score)].fall > base.policy.restart_share * best
     ]
-    known = [refits[id(score)] for score in behind]
-    items = [
-        (score, one.fall, one.inflation, one.assembly.corner)
-        for score, one in zip(behind, known, strict=True)
-    ]
+    items = [(score, refits[id(score)].fall, refits[id(score)].inflation) for score in behind]
     found = process_map(_restarted, (base, numerics, best), items, numerics.jobs, known=records_of)
     pairs = zip(behind, found, strict=True)
     return {id(score): replace(one, score=score) for score, one in pairs if one is not None}
 
 
 def _restarted(
-    shared: tuple[Base, Numerics, float], item: tuple[Score, float, float, str]
+    shared: tuple[Base, Numerics, float], item: tuple[Score, float, float]
 ) -> Refit | None:
     """A better estimate of one effect from other shapes, without its score; None where there is
-    none. Its best known fall, its inflation and its corner are given with it."""
-    (base, numerics, best), (score, fall, inflation, corner) = shared, item
+    none. Its best known fall and inflation are given with it."""
+    (base, numerics, best), (score, fall, inflation) = shared, item
     better, grids, tried = None, score.option.candidate.shapes, [dict(score.shapes)]
     for part in base.policy.shape_starts:
         if best - fall < base.policy.restart_gap * inflation:
@@ -352,7 +347,7 @@ def _restarted(
         if shapes in tried:  # of a scan of two values all parts are the first
             continue
         tried.append(shapes)
-        again = refit(base, replace(score, shapes=shapes), numerics, corner)
+        again = refit(base, replace(score, shapes=shapes), numerics)
         if np.isfinite(again.share) and again.fall > fall:
             better, fall, inflation = again, again.fall, again.inflation
     return None if better is None else replace(better, score=cast(Any, None))

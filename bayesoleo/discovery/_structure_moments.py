@@ -122,7 +122,7 @@ def _log_sides(
                 moments[k, 1], moments[k, 2] = _higher_moments(sides[k], distance)
         start += counts[k]
     # A zero that is no constant: for one, all that takes it would be compiled once more.
-    product, first = 1.0, int(counts[0]) - int(counts[0])
+    product, first = 1.0, 0 * counts[0]
     for i in range(len(counts)):
         second = first + counts[i]
         for j in range(i + 1, len(counts)):

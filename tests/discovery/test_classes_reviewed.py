@@ -339,8 +339,7 @@ def test_an_estimate_is_repeated_from_each_other_shape_once(monkeypatch, grid, f
     """Of a scan of few values several parts are the same one."""
     tried = []
 
-    def refit(_, score, __, corner):
-        assert corner == "sharp"
+    def refit(_, score, __):
         tried.append(score.shapes["r"])
         return SimpleNamespace(share=-np.inf)
 
@@ -349,7 +348,7 @@ def test_an_estimate_is_repeated_from_each_other_shape_once(monkeypatch, grid, f
     candidate = SimpleNamespace(shapes={"r": grid})
     score = SimpleNamespace(shapes={"r": first}, option=SimpleNamespace(candidate=candidate))
     base = SimpleNamespace(policy=SearchPolicy())
-    assert review._restarted((base, None, 100.0), (score, 0.0, 1.0, "sharp")) is None
+    assert review._restarted((base, None, 100.0), (score, 0.0, 1.0)) is None
     assert tried == expected
 
 
