@@ -326,6 +326,28 @@ def _after(typing: Any, start: Any, offset: Any) -> tuple[Any, Any]:
 after: Any = intrinsic(_after)
 
 
+def _numbers(typing: Any, address: Any) -> tuple[Any, Any]:
+    """Pointer to the numbers at an address.
+
+    An array is seven values, and counts references wherever it is passed: a function of twenty
+    arrays takes seconds to compile, one of their addresses a fraction.
+    """
+    return _POINTER(types.intp), _to_pointer
+
+
+def _integers(typing: Any, address: Any) -> tuple[Any, Any]:
+    """Pointer to the whole numbers at an address."""
+    return types.CPointer(types.int64)(types.intp), _to_pointer
+
+
+def _to_pointer(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    return builder.inttoptr(values[0], context.get_value_type(signature.return_type))
+
+
+numbers: Any = intrinsic(_numbers)
+integers: Any = intrinsic(_integers)
+
+
 def caller(signature: Any) -> Any:
     """Make ``call(address, arguments)``, by which compiled code calls a function at an address.
 

@@ -23,6 +23,8 @@ from bayesoleo.errors import InputError
 from bayesoleo.solvers import _elimination as sparse, _unrolled_program as unrolled
 from bayesoleo.solvers._elimination import close_and_sweep, eliminate_each, eliminate_together
 from bayesoleo.solvers._mesh import Mesh, Tableau, tableau
+from bayesoleo.solvers._period_arrangement import can_sweep
+from bayesoleo.solvers._swept_columns import swept_columns
 
 #: Steps of the mesh whose stages are eliminated together, innermost in memory.
 BLOCK = 32
@@ -183,7 +185,8 @@ def linear(
     a: Array, aa: Array, b: Array, ba: Array, c: Array, orders: Integers, initial: bool, dx: Array,
     monodromy: Array, ok: Flags,
 ) -> None:  # fmt: skip
-    """Eliminate every step's stages, close the period, and recover the stages."""
+    """Eliminate every step's stages, close the period, and recover the stages: of lanes whose rows
+    have to be exchanged, and where there is no code to sweep a scheme."""
     d, s = orders.size, b.size
     D, n, k = orders.sum(), dx.shape[1], right.shape[2]
     size = s * d
@@ -360,11 +363,11 @@ class SamplePlan:
     w2: Array
 
 
-def compile_elimination() -> None:
-    """Compile what sensitivities need, which takes ten seconds, or load it."""
-    scheme, points = Collocation(tableau("radau3"), (2,)), 8 * tableau("radau3").stages
-    right = np.zeros((1, 1, 1, points))
-    scheme.linear(np.ones((1, 1, 3, points)), right, None, np.arange(1), 1.0)
+def compile_exchange() -> None:
+    """Compile the elimination that exchanges rows, or load it: few models need it, and late."""
+    scheme = Collocation(tableau("radau3"), (2,))
+    gz, right = np.ones((1, 1, 3, scheme.method.stages)), np.zeros((1, 1, 1, scheme.method.stages))
+    scheme.linear(gz, right, None, np.arange(1), 1.0)  # one step is too few to be swept
 
 
 @dataclass(frozen=True)
@@ -553,10 +556,31 @@ class Collocation:
         dx = np.zeros((count, n, self.width, right.shape[2]))
         monodromy = np.full((count, self.state_size, self.state_size), np.nan)
         ok = np.ones(count, dtype=np.bool_)
+        h = self.lengths(n, step)
+        program, left = self.program, lanes
+        if program is not None and can_sweep(program, n):
+            swept_columns(program, gz, right, x, jumps, lanes, h, initial, (dx, monodromy, ok))
+            left = lanes[~ok[lanes]]
+        if left.size:
+            self._with_exchange(gz, right, x, left, h, initial, jumps, (dx, monodromy, ok))
+        return dx, monodromy, ok
+
+    def _with_exchange(
+        self,
+        gz: Array,
+        right: Array,
+        x: Array | None,
+        lanes: Integers,
+        h: Array,
+        initial: bool,
+        jumps: Array | None,
+        results: tuple[Array, Array, Flags],
+    ) -> None:
+        """Solve lanes whose rows may have to be exchanged, into the results."""
+        dx, monodromy, ok = results
         present = np.zeros((1, 1, 1)) if x is None else x
         added = np.zeros((1, 1, 1, 0)) if jumps is None else jumps
-        method = self.method
-        h = self.lengths(n, step)
+        method, n = self.method, dx.shape[1]
         linear(
             gz, right, present, x is not None, added, lanes, h, method.a, method.a @ method.a,
             method.b, method.b @ method.a, method.c, self._orders, initial, dx, monodromy, ok,
@@ -571,7 +595,6 @@ class Collocation:
                 found = sparse.collocation_step(gz[lane], right[lane], ends, method, self.orders, h)
                 ok[lane] = found is not None
                 dx[lane] = 0.0 if found is None else found
-        return dx, monodromy, ok
 
     def _jumps(self, x: Array, h: Array) -> Array:
         """From each step's end to the next node, shape (D, n), of unknowns ``x (n, w)``."""

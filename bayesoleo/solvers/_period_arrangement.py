@@ -12,15 +12,16 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesoleo._compiled import BLOCK, inner, jit
-from bayesoleo._types import Array, Flags, Float, Integers
+from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.solvers._blocked_collocation import columns_of
 from bayesoleo.solvers._unrolled_collocation import REACH, WIDTH
 from bayesoleo.solvers._unrolled_program import Program, chunks
@@ -146,6 +147,8 @@ class Sizes(NamedTuple):
 
     steps: int
     rows: int
+    positions: int
+    blocks: int
     inputs: int
     constants: int
     nz: int
@@ -159,6 +162,7 @@ class Sizes(NamedTuple):
     stages: int
     block: int
     transfer: int
+    columns: int
     measured: int
     chords: int
 
@@ -182,6 +186,7 @@ class SweepLayout:
     lengths: Integers
 
     @staticmethod
+    @lru_cache(maxsize=64)
     def of(n: int, front: int, block: int) -> SweepLayout:
         """For a period of ``n`` steps in blocks of ``block``, with ``front`` rows before it."""
         lengths = chunks(n)
@@ -213,20 +218,35 @@ class SweepKernels(NamedTuple):
     update: int
 
 
-class Sweep(NamedTuple):
-    """Order of the steps, inputs and lengths of steps, as they are swept; ``again`` is where the
-    step of each position stands for good."""
+def scheme_kernels(program: Program, model: tuple[int, int, int] = (0, 0, 0)) -> SweepKernels:
+    """Addresses of a scheme's pieces, behind those of a model: none where none is evaluated."""
+    return SweepKernels(
+        *model,
+        rows=program.rows,
+        eliminate=program.eliminate,
+        chain=program.chain,
+        substitute=program.substitute,
+        follow=program.follow,
+        product=program.product,
+        begin=program.begin,
+        update=program.update,
+    )
 
-    again: Integers
-    source: Integers
-    lengths: Integers
-    order: Integers
-    inputs: Array
-    h: Array
+
+class Sweep(NamedTuple):
+    """Order of the steps, inputs and lengths of steps, as they are swept, by their addresses:
+    ``again (positions,)``, where the step of each position stands for good, and those of
+    :class:`SweepLayout` and :class:`Arranged`."""
+
+    again: int
+    source: int
+    lengths: int
+    inputs: int
+    h: int
 
 
 class Work(NamedTuple):
-    """Arrays of one lane at a time, allocated once."""
+    """Addresses of the arrays of one lane at a time, which are allocated once."""
 
     now: Any
     base: Any
@@ -249,32 +269,47 @@ class Work(NamedTuple):
     constants: Any
 
 
-def work_space(sizes: Sizes, sweep: Sweep) -> Work:
-    """Arrays for lanes of given sizes; a thread keeps those it used last."""
-    key = sizes, sweep.source.size, sweep.inputs.shape[0], sweep.order.tobytes()
-    if getattr(_kept, "key", None) != key:
-        _kept.key, _kept.work = key, _allocate(*key[:3], sweep.order)
-    work: Work = _kept.work
-    return work
+def can_sweep(program: Program, n: int) -> bool:
+    """Whether there are enough of ``n`` steps for all chunks, and not too many for the memory."""
+    return n >= LEAST_STEPS and 8 * program.transfer * n <= MOST_BYTES
 
 
-def _allocate(sizes: Sizes, positions: int, blocks: int, order: Integers) -> Work:
+def work_space(sizes: Sizes, order: Sequence[int]) -> Work:
+    """Room for lanes of given sizes, whose history has the state in an order.
+
+    A thread keeps what it used last, for solutions and for their derivatives: addresses hold until
+    it asks for two others.
+    """
+    key = sizes, tuple(order)
+    rooms: dict[Any, tuple[Work, Work]] = _kept.__dict__.setdefault("rooms", {})
+    room = rooms.pop(key, None)
+    if room is None:
+        while len(rooms) > 1:
+            del rooms[next(iter(rooms))]
+        arrays = _allocate(*key)
+        room = arrays, Work(*[array.ctypes.data for array in arrays])
+    rooms[key] = room
+    return room[1]
+
+
+def _allocate(sizes: Sizes, order: tuple[int, ...]) -> Work:
     """Zeros, each array from the beginning of a cache line on: vector instructions that straddle
     two lines take twice as long."""
-    shapes = _shapes(sizes, positions, blocks)
+    shapes = _shapes(sizes)
     ends = list(accumulate(-(-math.prod(shape) // LINE) * LINE for shape in shapes))
     room = np.zeros(ends[-1] + LINE)
     room = room[-(room.ctypes.data // room.itemsize) % LINE :]
     begins = zip(shapes, [0, *ends], strict=False)
     work = Work(*[room[at : at + math.prod(shape)].reshape(shape) for shape, at in begins])
     own = np.arange(sizes.state)
-    work.history[order, own] = 1.0  # a chunk's first state, in terms of itself
+    work.history[list(order), own] = 1.0  # a chunk's first state, in terms of itself
     work.products[0, own, own] = 1.0
     return work
 
 
-def _shapes(sizes: Sizes, positions: int, blocks: int) -> Work:
+def _shapes(sizes: Sizes) -> Work:
     w, D, d = sizes.unknowns, sizes.state, sizes.d
+    positions, blocks = sizes.positions, sizes.blocks
     length = (blocks * sizes.block // WIDTH + 1) * sizes.new + sizes.window
     return Work(
         now=(w, positions),
@@ -289,7 +324,7 @@ def _shapes(sizes: Sizes, positions: int, blocks: int) -> Work:
         transfer=(blocks, sizes.transfer * sizes.block),
         history=(length, D + 1, WIDTH),
         start=(D, WIDTH),
-        products=(WIDTH + 1, D, columns_of(D)),
+        products=(WIDTH + 1, D, sizes.columns),
         closure=(D, D),
         scale=(D,),
         inverse=(D, D),
@@ -308,15 +343,17 @@ class Options(NamedTuple):
 
 
 class LinearStart(NamedTuple):
-    """Where lanes start: ``base (w, positions)`` and ``change (L, na)`` times ``slopes (na, w,
-    positions)``; empty where ``x`` says it."""
+    """Where lanes start: ``base (w, positions)`` and ``change (L, active)`` times ``slopes (active,
+    w, positions)``, by their addresses."""
 
-    base: Float[Array, "width positions"]
-    slopes: Float[Array, "active width positions"]
-    change: Float[Array, "vectors active"]
+    base: int
+    slopes: int
+    change: int
+    active: int
 
 
-NO_LINE = LinearStart(np.empty((0, 0)), np.empty((0, 0, 0)), np.empty((0, 0)))
+#: Where ``x`` says it.
+NO_LINE = LinearStart(0, 0, 0, 0)
 
 
 @dataclass(frozen=True)
@@ -329,8 +366,8 @@ class Arranged:
         The scheme's compiled pieces.
     layout : SweepLayout
         Order of the steps.
-    inputs, lengths : ndarray, shapes (b, nu, BLOCK) and (b, BLOCK)
-        Of each block.
+    inputs, lengths : ndarray, shapes (blocks, inputs, BLOCK) and (blocks, BLOCK)
+        Of each block, contiguous; at least one input, of zeros.
     """
 
     program: Program
@@ -357,18 +394,24 @@ class Arranged:
     @cached_property
     def sweep(self) -> Sweep:
         """The same for compiled code."""
-        layout, order = self.layout, np.array(self.program.order, dtype=np.int64)
-        source = layout.source
-        return Sweep(layout.place[source], source, layout.lengths, order, self.inputs, self.lengths)
+        layout = self.layout
+        arrays = self._again, layout.source, layout.lengths, self.inputs, self.lengths
+        return Sweep(*[array.ctypes.data for array in arrays])
 
-    def sizes(self, inputs: int, constants: int, conditions: int) -> Sizes:
-        """Sizes for a model with so many inputs, constants and admissibility conditions."""
+    @cached_property
+    def _again(self) -> Integers:
+        return self.layout.place[self.layout.source]
+
+    def sizes(self, constants: int, conditions: int) -> Sizes:
+        """Sizes for a model with so many constants and admissibility conditions."""
         program = self.program
         d = len(program.orders)
         return Sizes(
             steps=self.layout.place.size,
             rows=int(self.layout.lengths[0]),
-            inputs=inputs,
+            positions=self.layout.source.size,
+            blocks=self.inputs.shape[0],
+            inputs=self.inputs.shape[1],
             constants=constants,
             nz=sum(program.orders) + d,
             d=d,
@@ -381,6 +424,7 @@ class Arranged:
             stages=program.stages,
             block=program.steps,
             transfer=program.transfer,
+            columns=columns_of(program.state),
             measured=min(sum(program.orders), program.unknowns),
             chords=program.chords,
         )

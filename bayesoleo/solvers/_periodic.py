@@ -144,7 +144,7 @@ class Boundary:
         if program is None:
             return None
         n = self.inputs.shape[1] // program.stages
-        if n < arrangement.LEAST_STEPS or 8 * program.transfer * n > arrangement.MOST_BYTES:
+        if not arrangement.can_sweep(program, n):
             return None
         return arrangement.Arranged.of(program, self.inputs, self.scheme.lengths(n, self.step(n)))
 
@@ -234,7 +234,9 @@ def solve_extrapolated(
         return solve_periodic(problem, p, start, max_iterations=most, overwrite=True)
     x = np.empty((p.shape[0], *extrapolation.x.shape))
     moved = np.ascontiguousarray(change[:, extrapolation.moving])
-    line = arrangement.LinearStart(*extrapolation.swept(arranged.layout), moved)
+    base, slopes = extrapolation.swept(arranged.layout)
+    places = base.ctypes.data, slopes.ctypes.data, moved.ctypes.data
+    line = arrangement.LinearStart(*places, moved.shape[1])
     solution = _compiled(problem, arranged, p, x, most, True, line)
     return _with_exchange(
         problem, p, solution, lambda lanes: extrapolation.starts(change[lanes]), most, True
@@ -300,15 +302,11 @@ def _compiled(
     equations, program = problem.equations, arranged.program
     status = np.empty(x.shape[0], dtype=np.int64)
     iterations = np.zeros(x.shape[0], dtype=np.int64)
-    sizes = arranged.sizes(problem.inputs.shape[0], p.shape[1], problem.conditions)
-    pieces = arrangement.SweepKernels(
-        equations.residual.address, equations.jacobian.address, equations.admissible.address,
-        program.rows, program.eliminate, program.chain, program.substitute, program.follow,
-        program.product, program.begin, program.update,
-    )  # fmt: skip
-    sweep = arranged.sweep
+    sizes = arranged.sizes(p.shape[1], problem.conditions)
+    kernels = equations.residual, equations.jacobian, equations.admissible
+    pieces = arrangement.scheme_kernels(program, tuple(kernel.address for kernel in kernels))
     newton.solve_lanes(
-        pieces, sizes, sweep, arrangement.work_space(sizes, sweep),
+        pieces, sizes, arranged.sweep, arrangement.work_space(sizes, program.order),
         arrangement.Options(max_iterations, monotone, initial), p, x, line, status, iterations,
     )  # fmt: skip
     return Solution(x, status, iterations)

@@ -3,7 +3,8 @@
 It is the same iteration as in ``_periodic.py``, with all arrays of a lane in the processor's cache,
 and last steps with old derivatives. The linearised equations of a period are solved by a recursion
 through its steps. Models and schemes come as compiled pieces of fixed signature
-(``bayesoleo._compiled`` and ``_unrolled_program.py``), so this file is compiled once.
+(``bayesoleo._compiled`` and ``_unrolled_program.py``), and arrays as their addresses, so this file
+is compiled once, and fast.
 
 Starts that follow from one solution and its derivatives are made when they are needed. For a batch
 of parameter vectors all starts together exceed a processor's cache; the solution and its
@@ -19,7 +20,18 @@ from typing import Any
 import numpy as np
 from numba import carray
 
-from bayesoleo._compiled import BLOCK, after, call_kernel, caller, inlined, inner, jit, pointer
+from bayesoleo._compiled import (
+    BLOCK,
+    after,
+    call_kernel,
+    caller,
+    inlined,
+    inner,
+    integers,
+    jit,
+    numbers,
+    pointer,
+)
 from bayesoleo._types import Array, Integers
 from bayesoleo.solvers._elimination import LARGEST_GROWTH, close as solve_closure, close_balanced
 from bayesoleo.solvers._orbit import Status
@@ -46,11 +58,11 @@ INADMISSIBLE = Status.INADMISSIBLE.value
 SINGULAR = Status.SINGULAR.value
 NOT_FINITE = Status.NOT_FINITE.value
 
-_call_rows, _call_chain = caller(SIGNATURES["rows"]), caller(SIGNATURES["chain"])
-_call_eliminate = caller(SIGNATURES["eliminate"])
-_call_substitute, _call_follow = caller(SIGNATURES["substitute"]), caller(SIGNATURES["follow"])
-_call_product, _call_begin = caller(SIGNATURES["product"]), caller(SIGNATURES["begin"])
-_call_update = caller(SIGNATURES["update"])
+call_rows, call_chain = caller(SIGNATURES["rows"]), caller(SIGNATURES["chain"])
+call_eliminate = caller(SIGNATURES["eliminate"])
+call_substitute, call_follow = caller(SIGNATURES["substitute"]), caller(SIGNATURES["follow"])
+call_product, call_begin = caller(SIGNATURES["product"]), caller(SIGNATURES["begin"])
+call_update = caller(SIGNATURES["update"])
 NO_CONVERGENCE = Status.NO_CONVERGENCE.value
 #: Newton's error after a step is about the step squared: a relative step of 1e-7 that is still
 #: contracting leaves 1e-14. Steep friction contracts slower at first: no guess of the next step
@@ -76,71 +88,67 @@ FIRST_CHORD_FROM = 1e-2
 WITHOUT_SIGN = np.int64(2**63 - 1)
 
 
-@jit
-def keep(source: Array, target: Array) -> None:
-    _copy(pointer(source, 0), pointer(target, 0), source.size)
+@inner
+def keep(source: int, target: int, count: int) -> None:
+    """Copy numbers from one address to another."""
+    begin, to = carray(numbers(source), (count,)), carray(numbers(target), (count,))
+    for i in range(count):
+        to[i] = begin[i]
 
 
 @inner
-def _copy(source: Any, target: Any, count: int) -> None:
-    """Copy numbers. Cutting rows out of arrays instead would cost more than copying them: arrays
-    count references; and indices that may be negative allow no vector instructions."""
-    source, target = carray(source, (count,)), carray(target, (count,))
-    for i in range(count):
-        target[i] = source[i]
-
-
-@jit
-def take(base: Array, dx: Array, fraction: float, now: Array) -> None:
-    """``now = base + fraction dx``, two different arrays."""
-    size = now.size
-    to, change = carray(pointer(now, 0), (size,)), carray(pointer(dx, 0), (size,))
-    begin = carray(pointer(base, 0), (size,))
+def take(fraction: float, sizes: Sizes, work: Work) -> None:
+    """``now = base + fraction dx``."""
+    size = sizes.unknowns * sizes.positions
+    to, change = carray(numbers(work.now), (size,)), carray(numbers(work.dx), (size,))
+    begin = carray(numbers(work.base), (size,))
     for i in range(size):
         to[i] = begin[i] + fraction * change[i]
 
 
-@jit
-def move(now: Array, dx: Array) -> None:
-    """``now += dx``. In :func:`take` they would overlap, which forbids vector instructions."""
-    size = now.size
-    to, change = carray(pointer(now, 0), (size,)), carray(pointer(dx, 0), (size,))
+@inner
+def move(sizes: Sizes, work: Work) -> None:
+    """``now += dx``."""
+    size = sizes.unknowns * sizes.positions
+    to, change = carray(numbers(work.now), (size,)), carray(numbers(work.dx), (size,))
     for i in range(size):
         to[i] += change[i]
 
 
-@jit
+@inner
 def evaluate(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work) -> int:
     """Equations at the present unknowns, and the recursion that solves them linearised."""
     steps, stages = sizes.block, sizes.stages
     points, per_row = steps * stages, sizes.new * (sizes.state + 1) * WIDTH
-    x, u, h, p = pointer(work.x_block, 0), sweep.inputs, sweep.h, pointer(work.constants, 0)
-    z, out, sums = pointer(work.z, 0), pointer(work.out, 0), pointer(work.sums, 0)
-    work.sums[:] = 0.0
+    x, p = numbers(work.x_block), numbers(work.constants)
+    z, out, sums = numbers(work.z), numbers(work.out), numbers(work.sums)
+    squares = carray(sums, (2 * sizes.d * BLOCK,))
+    for i in range(2 * sizes.d * BLOCK):
+        squares[i] = 0.0
     bad, outside, odd = 0, 0, 0
-    for b in range(u.shape[0]):
+    for b in range(sizes.blocks):
         count = min(steps, sizes.rows * WIDTH - b * steps)
-        inputs, length = pointer(u, b * u.shape[1] * BLOCK), pointer(h, b * BLOCK)
-        now = pointer(work.now, b * steps)
-        _call_rows(pieces.rows, (now, x, length, z, work.now.shape[1], steps))
+        inputs = after(numbers(sweep.inputs), b * sizes.inputs * BLOCK)
+        length, now = after(numbers(sweep.h), b * BLOCK), after(numbers(work.now), b * steps)
+        call_rows(pieces.rows, (now, x, length, z, sizes.positions, steps))
         if sizes.conditions > 0:
             call_kernel(pieces.admissible, (z, inputs, p, out, points))
             broken, undefined = _outside(out, sizes, count)
             outside, odd = outside + broken, odd + undefined
         call_kernel(pieces.jacobian, (z, inputs, p, out, points))
-        if b == u.shape[0] - 1:
-            _silence(sizes, sweep.lengths, b, count, work.z, work.out)
-        transfer = pointer(work.transfer, b * work.transfer.shape[1])
+        if b == sizes.blocks - 1:
+            _silence(sizes, sweep, b, count, work)
+        transfer = after(numbers(work.transfer), b * sizes.transfer * steps)
         arguments = out, x, length, z, sums, transfer, count
-        bad += _call_eliminate(pieces.eliminate, arguments)
-        history = pointer(work.history, b * (steps // WIDTH) * per_row)
-        _call_chain(pieces.chain, (transfer, history, count // WIDTH, WIDTH))
+        bad += call_eliminate(pieces.eliminate, arguments)
+        history = after(numbers(work.history), b * (steps // WIDTH) * per_row)
+        call_chain(pieces.chain, (transfer, history, count // WIDTH, WIDTH))
     if outside > 0:
         return INADMISSIBLE
-    finite = odd == 0
+    finite, measures = odd == 0, carray(numbers(work.measures), (2 * sizes.d,))
     for k in range(2 * sizes.d):
-        work.measures[k] = total(work.sums[k]) / (sizes.steps * stages)
-        finite = finite and work.measures[k] < np.inf
+        measures[k] = total(carray(after(sums, k * BLOCK), (BLOCK,))) / (sizes.steps * stages)
+        finite = finite and measures[k] < np.inf
     if not finite:
         return NOT_FINITE
     return NEEDS_EXCHANGE if bad > 0 else CONVERGED
@@ -152,23 +160,23 @@ def evaluate_again(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work)
     unknowns are admissible."""
     steps, stages = sizes.block, sizes.stages
     points, per_row = steps * stages, sizes.new * (sizes.state + 1) * WIDTH
-    x, u, h, p = pointer(work.x_block, 0), sweep.inputs, sweep.h, pointer(work.constants, 0)
-    z, out = pointer(work.z, 0), pointer(work.out, 0)
+    x, p = numbers(work.x_block), numbers(work.constants)
+    z, out = numbers(work.z), numbers(work.out)
     outside, odd = 0, 0
-    for b in range(u.shape[0]):
+    for b in range(sizes.blocks):
         count = min(steps, sizes.rows * WIDTH - b * steps)
-        inputs, length = pointer(u, b * u.shape[1] * BLOCK), pointer(h, b * BLOCK)
-        now = pointer(work.now, b * steps)
-        _call_rows(pieces.rows, (now, x, length, z, work.now.shape[1], steps))
+        inputs = after(numbers(sweep.inputs), b * sizes.inputs * BLOCK)
+        length, now = after(numbers(sweep.h), b * BLOCK), after(numbers(work.now), b * steps)
+        call_rows(pieces.rows, (now, x, length, z, sizes.positions, steps))
         if sizes.conditions > 0:
             call_kernel(pieces.admissible, (z, inputs, p, out, points))
             broken, undefined = _outside(out, sizes, count)
             outside, odd = outside + broken, odd + undefined
         call_kernel(pieces.residual, (z, inputs, p, out, points))
-        transfer = pointer(work.transfer, b * work.transfer.shape[1])
-        _call_substitute(pieces.substitute, (out, x, length, transfer, count))
-        history = pointer(work.history, b * (steps // WIDTH) * per_row)
-        _call_follow(pieces.follow, (transfer, history, count // WIDTH, WIDTH))
+        transfer = after(numbers(work.transfer), b * sizes.transfer * steps)
+        call_substitute(pieces.substitute, (out, x, length, transfer, count))
+        history = after(numbers(work.history), b * (steps // WIDTH) * per_row)
+        call_follow(pieces.follow, (transfer, history, count // WIDTH, WIDTH))
     return outside == 0 and odd == 0
 
 
@@ -186,12 +194,14 @@ def _outside(a: Any, sizes: Sizes, count: int) -> tuple[int, int]:
 
 
 @inner
-def _silence(sizes: Sizes, lengths: Integers, b: int, count: int, z: Array, out: Array) -> None:
+def _silence(sizes: Sizes, sweep: Sweep, b: int, count: int, work: Work) -> None:
     """Keep points that repeat a step out of the measures: beyond the end, behind short chunks.
 
     They are equations of a step that stands elsewhere, and can be solved; nothing uses the result.
     """
-    steps = sizes.block
+    steps, lengths = sizes.block, carray(integers(sweep.lengths), (WIDTH,))
+    z = carray(numbers(work.z), (sizes.nz, BLOCK))
+    out = carray(numbers(work.out), (sizes.d, BLOCK))
     begin = (sizes.rows - 1) * WIDTH - b * steps
     for stage in range(sizes.stages):
         for i in range(steps):
@@ -206,15 +216,18 @@ def _silence(sizes: Sizes, lengths: Integers, b: int, count: int, z: Array, out:
 @inlined
 def close(pieces: SweepKernels, sizes: Sizes, work: Work) -> int:
     """Invert the closure of the period, from the recursion's matrices alone."""
-    inverse, closure, products = work.inverse, work.closure, work.products
-    history, whole, rest = pointer(work.history, 0), sizes.steps // WIDTH, sizes.steps % WIDTH
-    _call_product(pieces.product, (history, pointer(products, 0), whole, rest, WIDTH))
-    product = products[WIDTH]
+    D, products = sizes.state, numbers(work.products)
+    whole, rest = sizes.steps // WIDTH, sizes.steps % WIDTH
+    call_product(pieces.product, (numbers(work.history), products, whole, rest, WIDTH))
+    product = carray(after(products, WIDTH * D * sizes.columns), (D, sizes.columns))
+    inverse = carray(numbers(work.inverse), (D, D))
+    closure = carray(numbers(work.closure), (D, D))
     _set_identity(inverse)
     regular, growth = solve_closure(product, inverse, closure)
     if not regular or growth > LARGEST_GROWTH:
         _set_identity(inverse)
-        regular, growth = close_balanced(product, inverse, closure, work.scale)
+        scale = carray(numbers(work.scale), (D,))
+        regular, growth = close_balanced(product, inverse, closure, scale)
     if growth > LARGEST_GROWTH:
         return NEEDS_EXCHANGE
     return CONVERGED if regular else SINGULAR
@@ -230,29 +243,31 @@ def _set_identity(matrix: Array) -> None:
 @inlined
 def start_chunks(pieces: SweepKernels, sizes: Sizes, work: Work, initial: bool) -> None:
     """First state of every chunk: that of the period from its closure, or zero."""
-    history, whole, rest = pointer(work.history, 0), sizes.steps // WIDTH, sizes.steps % WIDTH
-    inverse, start = pointer(work.inverse, 0), pointer(work.start, 0)
-    _call_begin(pieces.begin, (history, inverse, start, whole, rest, 0 if initial else 1))
+    history, whole, rest = numbers(work.history), sizes.steps // WIDTH, sizes.steps % WIDTH
+    inverse, start = numbers(work.inverse), numbers(work.start)
+    call_begin(pieces.begin, (history, inverse, start, whole, rest, 0 if initial else 1))
 
 
 @inner
 def update(update: int, sizes: Sizes, sweep: Sweep, work: Work) -> None:
     """The Newton step block by block, and at positions that repeat a step."""
-    steps, dx = sizes.block, work.dx
+    steps, positions = sizes.block, sizes.positions
     per_row = sizes.new * (sizes.state + 1) * WIDTH
-    start, to = pointer(work.start, 0), pointer(work.dx_block, 0)
-    for b in range(sweep.inputs.shape[0]):
+    start, to = numbers(work.start), numbers(work.dx_block)
+    for b in range(sizes.blocks):
         count = min(steps, sizes.rows * WIDTH - b * steps)
-        transfer = pointer(work.transfer, b * work.transfer.shape[1])
-        history = pointer(work.history, b * (steps // WIDTH) * per_row)
-        begin = pointer(dx, sizes.front * WIDTH + b * steps)
-        size = dx.shape[1], count // WIDTH, WIDTH
-        _call_update(update, (transfer, history, start, to, begin, *size))
+        transfer = after(numbers(work.transfer), b * sizes.transfer * steps)
+        history = after(numbers(work.history), b * (steps // WIDTH) * per_row)
+        begin = after(numbers(work.dx), sizes.front * WIDTH + b * steps)
+        size = positions, count // WIDTH, WIDTH
+        call_update(update, (transfer, history, start, to, begin, *size))
+    again = carray(integers(sweep.again), (positions,))
     for k in range(sizes.unknowns):
+        dx = carray(after(numbers(work.dx), k * positions), (positions,))
         for i in range(sizes.front * WIDTH):
-            dx[k, i] = dx[k, sweep.again[i]]
-        for i in range((sizes.front + sizes.rows - 1) * WIDTH, sweep.source.size):
-            dx[k, i] = dx[k, sweep.again[i]]
+            dx[i] = dx[again[i]]
+        for i in range((sizes.front + sizes.rows - 1) * WIDTH, positions):
+            dx[i] = dx[again[i]]
 
 
 @jit
@@ -261,51 +276,63 @@ def solve_lanes(
     x: Array, line: LinearStart, status: Integers, iterations: Integers,
 ) -> None:  # fmt: skip
     """Newton's method for every lane of ``x (L, n, w)``, in place; see ``solve``."""
-    now = work.now
+    constants = carray(numbers(work.constants), (sizes.constants,))
     for lane in range(x.shape[0]):
         for k in range(sizes.constants):
-            work.constants[k] = p[lane, k]
-        if line.base.size > 0:
-            _extrapolate(line, lane, now)
+            constants[k] = p[lane, k]
+        solution = pointer(x, lane * sizes.steps * sizes.unknowns)
+        if line.base == 0:
+            as_swept(sizes, sweep, solution, work.now)
         else:
-            for k in range(sizes.unknowns):
-                for i in range(sweep.source.size):
-                    now[k, i] = x[lane, sweep.source[i], k]
+            _extrapolate(line, lane, sizes, work.now)
         status[lane], iterations[lane] = _iterate(pieces, sizes, sweep, work, options)
         if status[lane] != NEEDS_EXCHANGE:
-            _in_order(sizes, sweep, now, pointer(x, lane * sizes.steps * sizes.unknowns))
+            _in_order(sizes, sweep, work.now, solution)
 
 
 @inner
-def _in_order(sizes: Sizes, sweep: Sweep, now: Array, x: Any) -> None:
+def as_swept(sizes: Sizes, sweep: Sweep, x: Any, now: int) -> None:
+    """Copy a start ``x (n, w)`` to where the sweep has it."""
+    unknowns, positions = sizes.unknowns, sizes.positions
+    x, swept = carray(x, (sizes.steps, unknowns)), carray(numbers(now), (unknowns, positions))
+    source = carray(integers(sweep.source), (positions,))
+    for k in range(unknowns):
+        for i in range(positions):
+            swept[k, i] = x[source[i], k]
+
+
+@inner
+def _in_order(sizes: Sizes, sweep: Sweep, now: int, x: Any) -> None:
     """Copy a solution, step by step and unknown by unknown."""
-    unknowns, row = sizes.unknowns, now.shape[1]
-    x, swept = carray(x, (sizes.steps * unknowns,)), carray(pointer(now, 0), (now.size,))
+    unknowns, row = sizes.unknowns, sizes.positions
+    x, swept = carray(x, (sizes.steps * unknowns,)), carray(numbers(now), (unknowns * row,))
+    lengths = carray(integers(sweep.lengths), (WIDTH,))
     for k in range(unknowns):
         to = k
         for c in range(WIDTH):
             at = k * row + sizes.front * WIDTH + c
-            for _ in range(sweep.lengths[c]):
+            for _ in range(lengths[c]):
                 x[to] = swept[at]
                 to += unknowns
                 at += WIDTH
 
 
 @inner
-def _extrapolate(line: LinearStart, lane: int, now: Array) -> None:
+def _extrapolate(line: LinearStart, lane: int, sizes: Sizes, now: int) -> None:
     """``now = base + slopes change``, two slopes at a time."""
-    size, count = now.size, line.change.shape[1]
-    to, base = carray(pointer(now, 0), (size,)), carray(pointer(line.base, 0), (size,))
+    size, count = sizes.unknowns * sizes.positions, line.active
+    to, base = carray(numbers(now), (size,)), carray(numbers(line.base), (size,))
+    change, slopes = carray(after(numbers(line.change), lane * count), (count,)), line.slopes
     for i in range(size):
         to[i] = base[i]
     for k in range(0, count - count % 2, 2):
-        first, second = line.change[lane, k], line.change[lane, k + 1]
-        a = carray(pointer(line.slopes, k * size), (size,))
-        b = carray(pointer(line.slopes, (k + 1) * size), (size,))
+        first, second = change[k], change[k + 1]
+        a = carray(after(numbers(slopes), k * size), (size,))
+        b = carray(after(numbers(slopes), (k + 1) * size), (size,))
         for i in range(size):
             to[i] += first * a[i] + second * b[i]
     for k in range(count - count % 2, count):
-        first, a = line.change[lane, k], carray(pointer(line.slopes, k * size), (size,))
+        first, a = change[k], carray(after(numbers(slopes), k * size), (size,))
         for i in range(size):
             to[i] += first * a[i]
 
@@ -316,32 +343,32 @@ def _iterate(
 ) -> tuple[int, int]:
     """Newton's method from ``work.now``; returns how it ended and the number of steps."""
     outcome, iteration = evaluate(pieces, sizes, sweep, work), 0
-    last, chords = np.inf, True
+    last, chords, everything = np.inf, True, sizes.unknowns * sizes.positions
     while outcome == CONVERGED and iteration < options.max_iterations:
         iteration += 1
         outcome = _step(pieces, sizes, sweep, work, options.initial)
         if outcome != CONVERGED:
             return outcome, iteration
-        size, least = _size(work.now, work.dx, sizes.front * WIDTH, sizes.measured, work.scratch)
+        size, least = _size(sizes, work)
         if not size < np.inf:
             return SINGULAR, iteration
         if least < SMALL_STEP or (size < 0.1 * last and size < LAST_STEP):
-            move(work.now, work.dx)
+            move(sizes, work)
             return CONVERGED, iteration
         early = sizes.chords > FEW_CHORDS and size < FIRST_CHORD_FROM and not options.initial
         if chords and (early or (last < CHORD_FROM and _chord_suffices(size, last))):
-            keep(work.now, work.base)
+            keep(work.now, work.base, everything)
             steps, last = _chords(pieces, sizes, sweep, work, options, size)
             iteration += steps
             if last == 0.0:
                 return CONVERGED, iteration
             chords = last < size
             if not chords:
-                keep(work.base, work.now)
+                keep(work.base, work.now, everything)
             outcome = evaluate(pieces, sizes, sweep, work)
             if chords and outcome != CONVERGED:  # the last of them led out of the region
                 chords = False
-                keep(work.base, work.now)
+                keep(work.base, work.now, everything)
                 outcome = evaluate(pieces, sizes, sweep, work)
             continue
         outcome, fraction, merit = _advance(pieces, sizes, sweep, work, options.monotone, size)
@@ -364,21 +391,21 @@ def _chords(
     """
     last, most = size, sizes.chords
     for count in range(1, most + 1):
-        move(work.now, work.dx)
+        move(sizes, work)
         if not evaluate_again(pieces, sizes, sweep, work):
             return count, np.inf
         start_chunks(pieces, sizes, work, options.initial)
         update(pieces.update, sizes, sweep, work)
-        size, least = _size(work.now, work.dx, sizes.front * WIDTH, sizes.measured, work.scratch)
+        size, least = _size(sizes, work)
         if not size < SLOW_CHORD * last:
             return count, np.inf
         # What is left is a geometric series, twice as steep as seen where the first of the two
         # steps was one of Newton's.
         if least < SMALL_STEP or 2.0 * size * size / last < CHORD_LEFT:
-            move(work.now, work.dx)
+            move(sizes, work)
             return count, 0.0
         if count == most or size * (size / last) ** (most - count) > CHORD_LEFT:
-            move(work.now, work.dx)
+            move(sizes, work)
             return count, size
         last = size
     return most, last
@@ -399,22 +426,25 @@ def _advance(
 ) -> tuple[int, float, float]:
     """Take the step, halved while it is inadmissible or does not reduce the residual; returns how
     that ended, the fraction taken and the residual's size after it."""
-    keep(work.now, work.base)
-    keep(work.measures, work.before)
+    everything = sizes.unknowns * sizes.positions
+    keep(work.now, work.base, everything)
+    keep(work.measures, work.before, 2 * sizes.d)
     fraction, outcome = 1.0, CONVERGED
     for _ in range(MAXIMUM_HALVINGS):
-        take(work.base, work.dx, fraction, work.now)
+        take(fraction, sizes, work)
         outcome = evaluate(pieces, sizes, sweep, work)
         if outcome == NEEDS_EXCHANGE:
             return outcome, fraction, np.inf
         if outcome == CONVERGED:
-            falls, merit = _reduces(work.before, work.measures, sizes.d)
+            before = carray(numbers(work.before), (2 * sizes.d,))
+            after_it = carray(numbers(work.measures), (2 * sizes.d,))
+            falls, merit = _reduces(before, after_it, sizes.d)
             # Close to the solution round-off keeps the residual from falling; the step's own size
             # then decides.
             if falls or size < 1e-5 or not monotone:
                 return outcome, fraction, merit
         fraction *= 0.5
-    keep(work.base, work.now)
+    keep(work.base, work.now, everything)
     return (INADMISSIBLE if outcome == INADMISSIBLE else NO_CONVERGENCE), fraction, np.inf
 
 
@@ -428,43 +458,45 @@ def _step(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, initial:
     return outcome
 
 
-@jit
-def _size(x: Array, dx: Array, begin: int, measured: int, scratch: Array) -> tuple[float, float]:
+@inner
+def _size(sizes: Sizes, work: Work) -> tuple[float, float]:
     """Largest change of a state, over what :func:`unit` says; not finite where one is not.
 
     Also over its largest value, which digits are lost against.
     """
     size = least = 0.0
-    count = x.shape[1] - begin
-    for k in range(x.shape[0]):
-        at = k * x.shape[1] + begin
-        change = _largest(pointer(dx, at), count, 0.0, scratch)
+    begin = sizes.front * WIDTH
+    count = sizes.positions - begin
+    for k in range(sizes.unknowns):
+        at = k * sizes.positions + begin
+        change = _largest(after(numbers(work.dx), at), count, 0.0, work.scratch)
         if not change < np.inf:
             return np.inf, np.inf
-        if k < measured and change > 0.0:
-            level = x[k, begin]
-            motion = _largest(pointer(x, at), count, level, scratch)
+        if k < sizes.measured and change > 0.0:
+            x = after(numbers(work.now), at)
+            level = carray(x, (1,))[0]
+            motion = _largest(x, count, level, work.scratch)
             size = max(size, change / unit(motion, level, change))
             least = max(least, change / max(motion + abs(level), change))
     return size, least
 
 
 @inner
-def _largest(values: Any, count: int, level: float, scratch: Array) -> float:
+def _largest(values: Any, count: int, level: float, scratch: int) -> float:
     """Largest distance from a level, not a number where one is not.
 
     Without their sign, floating-point numbers are ordered as the integers with their bits, and what
     is not finite comes last: integers, which have no exceptions, are compared in vectors.
     """
-    values, distances = carray(values, (count,)), carray(pointer(scratch, 0), (count,))
+    values, distances = carray(values, (count,)), carray(numbers(scratch), (count,))
     for i in range(count):
         distances[i] = values[i] - level
-    bits, largest = scratch.view(np.int64), np.int64(0)
+    bits, largest = carray(integers(scratch), (count,)), np.int64(0)
     for i in range(count):
         magnitude = bits[i] & WITHOUT_SIGN
         largest = magnitude if magnitude > largest else largest
     bits[0] = largest
-    return float(scratch[0])
+    return float(distances[0])
 
 
 @inlined

@@ -89,6 +89,16 @@ SOLVERS: Rows = {
          "falls = np.sqrt(new) > max(np.sqrt(old), ROUND_OFF)",
          "solvers/test_compiled_sweep.py::test_a_residual_falls_in_the_larger_of_its_terms"),
     ],
+    "solvers/_swept_columns.py": [
+        ("a velocity that jumps moves the value along its step",
+         "value += h[i] * rate - jumps",
+         "value += -jumps",
+         "solvers/test_swept_columns.py::test_columns_with_jumps_solve_the_period"),
+        ("a derivative depends on which of the columns is the first",
+         "if column > 0 or given.x == 0:",
+         "if column > 0:",
+         "solvers/test_sensitivities.py::test_columns_that_move_nothing_are_left_out_and_change_no_other"),
+    ],
     "solvers/_periodic.py": [
         ("a transient begins where a period would close",
          "start.copy(), most, False, initial=True)",

@@ -49,7 +49,7 @@ def test_a_comparison_needs_nothing_that_was_not_compiled_ahead():
 @pytest.mark.parametrize(
     ("function", "compiled"),
     [
-        ("compile_ahead", [("_collocation", "linear"), *EVIDENCE]),
+        ("compile_ahead", [("_sum_of_squares", "_compare"), *EVIDENCE]),
         ("compile_after_simulation", [("_periodic_newton", "solve_lanes"), *EVIDENCE]),
     ],
 )

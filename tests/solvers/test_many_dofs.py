@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import ctypes
 from functools import cache
 
 import numpy as np
 import pytest
 from periodic_problems import harmonics, problem, rest
 
+from bayesoleo._compiled import _Callback
 from bayesoleo.model import Model, Parameter
 from bayesoleo.solvers import (
     _period_arrangement as arrangement,
     _periodic as periodic,
-    _periodic_newton as newton,
     _unrolled_program as program,
 )
 from bayesoleo.solvers._mesh import tableau
@@ -208,7 +209,8 @@ def test_nothing_is_left_of_the_solve_before(ties):
     boundary, p = discretised(5, 16, ties)
     start = rest(boundary, 16)
     first = solve_periodic(boundary, p, start)
-    arrangement._kept.work.transfer[:] = np.nan
+    for arrays, _ in arrangement._kept.rooms.values():
+        arrays.transfer[:] = np.nan
     again = solve_periodic(boundary, p, start)
     assert again.status[0] == Status.CONVERGED
     np.testing.assert_array_equal(again.x, first.x)
@@ -222,25 +224,19 @@ def test_near_a_solution_derivatives_are_made_once(d, monkeypatch):
     n = 40
     boundary, p = discretised(d, n)
     start = 1.001 * solve_periodic(boundary, p, rest(boundary, n)).x
-    made = []
+    blocks = boundary.arranged.inputs.shape[0]
+    calls, original = [], _Callback(boundary.equations.jacobian.address)
 
-    def evaluate(*arguments, original=newton.evaluate):
-        made.append(1)
-        return original(*arguments)
+    @_Callback
+    def watched(*arguments):
+        calls.append(1)
+        original(*arguments)
 
-    def as_written(pieces, sizes, sweep, work, options, p, x, line, status, iterations):
-        """One lane, without being compiled, so that it can be watched."""
-        work.constants[:] = p[0]
-        work.now[:] = x[0][sweep.source].T
-        found = newton._iterate.py_func(pieces, sizes, sweep, work, options)
-        status[0], iterations[0] = found
-
-    monkeypatch.setattr(newton, "evaluate", evaluate)
-    monkeypatch.setattr(newton, "_advance", newton._advance.py_func)
-    monkeypatch.setattr(newton, "solve_lanes", as_written)
+    address = ctypes.cast(watched, ctypes.c_void_p).value
+    monkeypatch.setitem(vars(boundary.equations.jacobian), "address", address)
     found = solve_periodic(boundary, p, start)
     assert found.status[0] == Status.CONVERGED
-    assert len(made) == 1
+    assert len(calls) == blocks
     assert found.iterations[0] <= 4
 
 
