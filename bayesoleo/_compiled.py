@@ -13,7 +13,7 @@ import ctypes
 import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import prod
 from pathlib import Path
 from typing import Any, Protocol, cast
@@ -346,6 +346,20 @@ def _to_pointer(context: Any, builder: Any, signature: Any, values: Any) -> Any:
 
 numbers: Any = intrinsic(_numbers)
 integers: Any = intrinsic(_integers)
+
+
+def record[T: tuple[int, ...]](values: T) -> T:
+    """Named whole numbers as one record, which compiled functions hand on by its address.
+
+    They read it as the tuple that is given; sixty numbers would be sixty arguments.
+    """
+    names = cast(Any, values)._fields
+    return cast(T, _record(names, tuple(values)))
+
+
+@lru_cache(maxsize=1024)
+def _record(names: tuple[str, ...], values: tuple[int, ...]) -> Any:
+    return np.array([values], dtype=[(name, np.int64) for name in names])[0]
 
 
 def caller(signature: Any) -> Any:

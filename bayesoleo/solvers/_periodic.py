@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from bayesoleo._compiled import BlockKernel, ImplicitEquations
+from bayesoleo._compiled import BlockKernel, ImplicitEquations, record
 from bayesoleo._types import Array, Flags, Float, Int, Integers
 from bayesoleo.solvers import (
     _period_arrangement as arrangement,
@@ -305,8 +305,9 @@ def _compiled(
     sizes = arranged.sizes(p.shape[1], problem.conditions)
     kernels = equations.residual, equations.jacobian, equations.admissible
     pieces = arrangement.scheme_kernels(program, tuple(kernel.address for kernel in kernels))
+    work = arrangement.work_space(sizes, program.order)
     newton.solve_lanes(
-        pieces, sizes, arranged.sweep, arrangement.work_space(sizes, program.order),
+        record(pieces), record(sizes), record(arranged.sweep), record(work),
         arrangement.Options(max_iterations, monotone, initial), p, x, line, status, iterations,
     )  # fmt: skip
     return Solution(x, status, iterations)

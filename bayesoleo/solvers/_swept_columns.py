@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import carray
 
-from bayesoleo._compiled import BLOCK, after, inner, integers, jit, numbers, pointer
+from bayesoleo._compiled import BLOCK, after, inner, integers, jit, numbers, pointer, record
 from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.solvers import _period_arrangement as arrangement
 from bayesoleo.solvers._period_arrangement import Sizes, Sweep, SweepKernels, Work
@@ -80,9 +80,10 @@ def swept_columns(
     ]
     places = (0 if array.size == 0 else array.ctypes.data for array in kept)
     given = dict(zip(("gz", "right", "x", "jumps"), places, strict=True))
+    work = arrangement.work_space(order.sizes, program.order)
     solve_columns(
-        order.pieces, order.sizes, order.sweep._replace(h=length.ctypes.data),
-        arrangement.work_space(order.sizes, program.order), initial,
+        record(order.pieces), record(order.sizes),
+        record(order.sweep._replace(h=length.ctypes.data)), record(work), initial,
         Given(**given, orders=order.orders.ctypes.data, columns=right.shape[2]), lanes, *results,
     )  # fmt: skip
 
