@@ -19,7 +19,7 @@ from bayesoleo.discovery._assembly import Assembly, Roles
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._ranking import Ranked
-from bayesoleo.discovery._refit import compare, inflation_along, quick_fit
+from bayesoleo.discovery._refit import compare, inflation_along, quick_fit, schwarz_price
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score, score_all
 from bayesoleo.discovery._state import State, fit_state
@@ -31,13 +31,14 @@ WIDER = (0.5, 4.0, 2.0, 1.0)
 
 
 def cornered(state: State, roles: Roles, numerics: Numerics, callback: ProgressCallback) -> State:
-    """The state with the corner of dry friction that makes the data clearly likelier.
+    """The state with the corner of dry friction that makes the data clearly likelier, without an
+    effect that only made up for it.
 
     It is taken only where noise explains all that is left with it. Beside an effect that is missing
     another corner makes up for a part of that.
 
-    Where noise explains what the present corner leaves, the tails of an arctangent may still be a
-    part of it that shows in runs which were not fitted, and one other is tried.
+    Where noise explains what one effect with the present corner leaves, the tails of an arctangent
+    may still be a part of it that shows in runs which were not fitted, and one other is tried.
 
     Parameters
     ----------
@@ -50,18 +51,8 @@ def cornered(state: State, roles: Roles, numerics: Numerics, callback: ProgressC
     """
     if not state.assembly.has_corner:
         return state
-    others = other_corners(state.assembly.corner)[: 1 if state.at_floor else None]
-    base, best, found = state.base(), 0.0, None
-    names = [name for step in state.assembly.steps for name in step.amplitudes]
     callback("test whether friction has another corner")
-    for corner in others:
-        assembly, fit = with_other_corner(base, state.assembly, state.fit, corner, numerics)
-        share, changes = compare(base, fit)
-        fall, noise = share * base.fall_back, inflation_along(base, fit, names, changes)
-        reached = base.excess - fall < base.feigned
-        # Two forms with as many unknowns are told apart as two effects are.
-        if reached and noise and fall - best > base.policy.equal_likelihood * noise.value:
-            found, best = (assembly, fit), fall
+    found = _likelier(state, numerics)
     if found is None:
         return state
     assembly, fit = found
@@ -70,6 +61,32 @@ def cornered(state: State, roles: Roles, numerics: Numerics, callback: ProgressC
         return state  # finer steps, or runs that were not fitted, speak against it
     callback(f"take {assembly.corner} for the sign of the velocity in dry friction")
     return other
+
+
+def _likelier(state: State, numerics: Numerics) -> tuple[Assembly, ModelFit] | None:
+    """The state's model, or that without one of its effects, with the corner that makes the data
+    clearly likeliest, unknowns counted, and leaves only noise; None if none does.
+
+    Two effects may make up for a corner down to the noise, as friction at breakaway and damping by
+    a power law do.
+    """
+    steps, base = state.assembly.steps, state.base()
+    several, price = len(steps) > 1, schwarz_price(base)
+    forms = [state.assembly, *(state.assembly.without(step) for step in steps if several)]
+    others = other_corners(state.assembly.corner)[: None if several or not state.at_floor else 1]
+    best, found = 0.0, None
+    for form in [form for form in forms if form.has_corner]:
+        names = [name for step in form.steps for name in step.amplitudes]
+        for corner in others:
+            assembly, fit = with_other_corner(base, form, state.fit, corner, numerics)
+            share, changes = compare(base, fit)
+            fall, noise = share * base.fall_back, inflation_along(base, fit, names, changes)
+            reached = base.excess - fall < base.feigned
+            # They are told apart as two effects are.
+            worth = fall + price * (len(base.fit.problem.names) - len(fit.problem.names))
+            if reached and noise and worth - best > base.policy.equal_likelihood * noise.value:
+                best, found = worth, (assembly, fit)
+    return found
 
 
 def other_corners(corner: str) -> list[str]:
@@ -82,7 +99,9 @@ def with_other_corner(
 ) -> tuple[Assembly, ModelFit]:
     """A model with another corner of dry friction, and its estimate from the present one."""
     present = assembly.model().parameters
-    widths = [name for name in fit.shared if present[name].description == TRANSITION]
+    widths = [
+        name for name in fit.shared if name in present and present[name].description == TRANSITION
+    ]
     starts = [fit.values | {name: factor * fit.shared[name] for name in widths} for factor in WIDER]
     other = assembly.with_corner(corner)
     return other, quick_fit(base, other.model(), starts, numerics)

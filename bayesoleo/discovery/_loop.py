@@ -556,6 +556,12 @@ def _in_corner(
         turned = cornered(state, roles, numerics, callback)
         if turned is state:
             break
+        notes += [
+            f"{effect} was removed again because it made up for the corner of friction, which is"
+            f" {turned.assembly.corner}"
+            for effect, target in state.assembly.added
+            if (effect, target) not in turned.assembly.added
+        ]
         state = eliminated(turned, before, roles, numerics, notes, callback, last_too=True)
     return state
 

@@ -249,7 +249,9 @@ def _added_by(progress: Progress, step: AddedEffect) -> int | None:
         if item.accepted is not None and (item.accepted.effect, item.accepted.target) == key:
             beside = set(item.before.assembly.added)
             now = set(progress.state.assembly.added) - {key}
-            return None if beside == now else number
+            corner = item.before.assembly.corner
+            same = beside == now and corner == progress.state.assembly.corner
+            return None if same else number
     return None
 
 
@@ -269,7 +271,8 @@ def place_of(
     """
     final, accepted = progress.state, progress.rounds[number].accepted
     assert accepted is not None
-    less = final.assembly.without(step)
+    # With the corner that was found, also where only this effect had it.
+    less = final.assembly.without(step).with_corner(final.assembly.corner)
     left = set(less.added)
     gone = [one for one in final.assembly.steps if (one.effect.id, one.target) not in left]
     if any(one is not step and one.effect.family not in ABSORBING_FAMILIES for one in gone):
@@ -362,7 +365,8 @@ def _in_exchange(
     spanned: Set[str],
     numerics: Numerics,
 ) -> dict[int, Refit]:
-    """Better estimates of effects that the final model produces already, led from its estimate.
+    """Better estimates of kin, and of effects that the final model produces already, led from its
+    estimate.
 
     Near the final estimate such an effect says the same as the one that was added, in other words,
     as an error of a mass and one of a force's gain do. Far from it, where the added effect is
@@ -373,7 +377,9 @@ def _in_exchange(
     least = refits[id(own)].fall
     found = {}
     for score in chosen[1:]:
-        if f"{score.option.candidate.effect} at {score.option.candidate.target}" not in spanned:
+        one = score.option.candidate
+        # What the other effects make up for while this one is absent may hide a law like it.
+        if not _kin(own, score) and f"{one.effect} at {one.target}" not in spanned:
             continue
         known = refits[id(score)]
         if known.fall > least - base.policy.restart_gap * known.inflation:
@@ -421,7 +427,7 @@ def _worth_estimating(
     only_known: bool,
     policy: SearchPolicy,
 ) -> list[Score]:
-    """Rivals that score near an effect, the best first, and members of its earlier class."""
+    """Rivals that score near an effect: the best, its kin, and members of its earlier class."""
     absorbs = own.option.candidate.family in ABSORBING_FAMILIES
     near = [
         score
@@ -431,8 +437,16 @@ def _worth_estimating(
     ]
     most = policy.review_rivals
     chosen = [] if only_known else near[:most]
+    if not only_known:
+        chosen += [score for score in near[most:] if _kin(own, score)]
     before = [one for one in others if name_among(own, one) in same and one not in chosen]
     return [*chosen, *before[:most]]
+
+
+def _kin(own: Score, other: Score) -> bool:
+    """Whether another effect is of the same family at the same place, as two laws of damping."""
+    mine, its = own.option.candidate, other.option.candidate
+    return (mine.family, mine.target) == (its.family, its.target)
 
 
 def _replaced(
@@ -447,7 +461,8 @@ def _replaced(
     """The search with another effect in a place, unless the hold-out runs contradict it."""
     final = progress.state
     start = place.base.fit.point.theta
-    before = fit_state(final.assembly.without(step), roles, numerics, start=start)
+    less = final.assembly.without(step).with_corner(final.assembly.corner)
+    before = fit_state(less, roles, numerics, start=start)
     assert better.refit is not None
     assert place.own.refit is not None
     after, reason = confirmed(before, better, better.refit, roles, numerics, callback)

@@ -27,6 +27,7 @@ from bayesoleo.discovery._round import Progress, Round
 from bayesoleo.discovery._score_tests import score_all
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.effects import find_effect
+from bayesoleo.effects._forces import ARCTANGENT, HYPERBOLIC
 
 POLICY = SearchPolicy()
 
@@ -37,8 +38,9 @@ def accepted(effect, same):
     return Ranked(score, 1e-6, 0.9, True, same)
 
 
-def progress_of(*found):
-    """Rounds that accepted these one after the other, one that accepted none, and their model."""
+def progress_of(*found, corner=ARCTANGENT):
+    """Rounds that accepted these one after the other, one that accepted none, and their model, with
+    a corner of friction."""
     keys = [(item.effect, item.target) for item in found]
 
     def state(count):
@@ -46,7 +48,9 @@ def progress_of(*found):
             SimpleNamespace(effect=SimpleNamespace(id=e, family="friction"), target=t)
             for e, t in keys[:count]
         ]
-        return SimpleNamespace(assembly=SimpleNamespace(steps=steps, added=tuple(keys[:count])))
+        added, last = tuple(keys[:count]), count == len(found)
+        known = corner if last else ARCTANGENT
+        return SimpleNamespace(assembly=SimpleNamespace(steps=steps, added=added, corner=known))
 
     rounds = [
         Round(state(k), (item,), {}, item, state(k + 1), "", 60.0) for k, item in enumerate(found)
@@ -76,6 +80,30 @@ def test_a_single_effect_is_not_looked_at_again(monkeypatch, same):
     found = progress_of(accepted("cubic_stiffness", same))
     monkeypatch.setattr(review, "place_of", lambda *_: pytest.fail("asked again"))
     assert review.reviewed(found, None, None, None, lambda _: None) is found
+
+
+def test_a_single_effect_is_looked_at_again_where_friction_got_another_corner(monkeypatch):
+    found = progress_of(accepted("power_law_damping", ()), corner=HYPERBOLIC)
+    asked = []
+    place = SimpleNamespace(number=0, own=found.rounds[0].accepted, better=(), rivals=())
+    monkeypatch.setattr(review, "place_of", lambda *_, **__: asked.append(1) or place)
+    review.reviewed(found, None, None, None, lambda _: None)
+    assert asked
+
+
+def test_laws_of_one_family_are_compared_however_many_score_higher():
+    def score(effect, fall, family="friction"):
+        candidate = SimpleNamespace(effect=effect, target="stroke", family=family)
+        option = SimpleNamespace(candidate=candidate, key=(effect, "stroke"))
+        return SimpleNamespace(option=option, fall=fall)
+
+    own, kin = score("power_law_damping", 100.0), score("quadratic_damping", 80.0)
+    others = [score(f"other_{k}", 90.0 + k, "stiffness") for k in range(POLICY.review_rivals)]
+    chosen = review._worth_estimating(own, [*others, kin], (), False, POLICY)
+    assert chosen[:-1] == others[::-1]
+    assert chosen[-1] is kin
+    known = review._worth_estimating(own, [*others, kin], (), True, POLICY)
+    assert known == []
 
 
 NAMES = (

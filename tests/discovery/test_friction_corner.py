@@ -177,19 +177,27 @@ def test_every_corner_is_tried_where_the_effect_was_chosen(tmp_path, corner):
 
 def test_all_effects_are_tested_again_with_another_corner(monkeypatch):
     """An effect may have made up for the corner that the model had; it goes with it."""
-    states, told = ["round", "needed", "turned", "without"], []
+    keys = ("coulomb_friction", "stroke"), ("stribeck_friction", "stroke")
+    needed, turned, without = (
+        SimpleNamespace(assembly=SimpleNamespace(added=keys[:count], corner=HYPERBOLIC))
+        for count in (2, 1, 1)
+    )
+    told, notes = [], []
 
     def eliminated(state, before, *_, last_too=False):
         told.append((state, before, last_too))
-        return states[states.index(state) + 1]
+        return without
 
     monkeypatch.setattr(loop_module, "eliminated", eliminated)
     monkeypatch.setattr(
-        loop_module, "cornered", lambda state, *_: "turned" if state == "needed" else state
+        loop_module, "cornered", lambda state, *_: turned if state is needed else state
     )
-    found = loop_module._in_corner("needed", "before", None, NUMERICS, [], silent)
-    assert found == "without"
-    assert told == [("turned", "before", True)]
+    found = loop_module._in_corner(needed, "before", None, NUMERICS, notes, silent)
+    assert found is without
+    assert told == [(turned, "before", True)]
+    assert len(notes) == 1
+    assert "stribeck_friction was removed again" in notes[0]
+    assert HYPERBOLIC in notes[0]
 
 
 def test_a_corner_goes_with_its_friction(sharp):
@@ -251,6 +259,17 @@ def test_the_corner_is_looked_at_again_when_another_effect_was_added(tmp_path):
     assert found.at_floor
     # It is right now.
     assert cornered(found, roles, NUMERICS, silent) is found
+
+
+@pytest.mark.parametrize("second", ["stribeck_friction", "power_law_damping"])
+def test_an_effect_that_made_up_for_the_corner_goes(sharp, second):
+    """Both together leave nothing but noise, or little more."""
+    roles = assign(sharp.fit.records)
+    both = added(added(sharp, "coulomb_friction"), second)
+    found = cornered(both, roles, NUMERICS, silent)
+    assert found.assembly.corner == HYPERBOLIC
+    assert [effect for effect, _ in found.assembly.added] == ["coulomb_friction"]
+    assert found.at_floor
 
 
 def test_structures_are_scored_with_the_corner_that_was_found(sharp):
