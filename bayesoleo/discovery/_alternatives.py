@@ -44,6 +44,7 @@ from bayesoleo.discovery._refit import (
     compare,
     fall_from,
     inflation_along,
+    price_in,
     quick_fit,
     refit_all,
     schwarz_price,
@@ -217,9 +218,7 @@ def loss_of(base: Base, step: AddedEffect, fit: ModelFit) -> Loss:
     measured = inflation_along(base, base.fit, names, changes)
     found, spread = Inflation(1.0, 0) if measured is None else measured, dispersion(base)
     noise = Inflation(found.value * spread, found.freedom, found.on_trial * spread)
-    # The logarithm is that of the effective number of independent samples.
-    price = max(schwarz_price(base) - float(np.log(noise.on_trial)), 1.0)
-    return Loss(step, -share * base.fall_back, len(names), price, noise)
+    return Loss(step, -share * base.fall_back, len(names), price_in(base, noise), noise)
 
 
 def dispersion(base: Base) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from bayesoleo._compiled import is_compiled
 from bayesoleo._parallel import available_cores, thread_limit
 from bayesoleo._worker_processes import begin_elsewhere
-from bayesoleo.solvers._periodic_newton import solve_lanes
+from bayesoleo.solvers._collocation import linear
 
 if TYPE_CHECKING:
     from bayesoleo.prediction._periodic_run import RunPredictor
@@ -31,7 +31,7 @@ def begin_compiling(jobs: int | None, *, simulated: bool = False) -> None:
     simulated : bool
         The search follows a simulation by this process.
     """
-    if min(thread_limit(), jobs or available_cores()) > 1 and not is_compiled(solve_lanes):
+    if min(thread_limit(), jobs or available_cores()) > 1 and not is_compiled(linear):
         function = compile_after_simulation if simulated else compile_ahead
         begin_elsewhere(__name__, function.__name__)
 

@@ -11,6 +11,7 @@ each, friction of a flexible form explains what two other effects do.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from bayesoleo.discovery._assembly import Assembly, Roles
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._ranking import Ranked
-from bayesoleo.discovery._refit import compare, inflation_along, quick_fit, schwarz_price
+from bayesoleo.discovery._refit import compare, inflation_along, price_in, quick_fit
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score, score_all
 from bayesoleo.discovery._state import State, fit_state
@@ -71,22 +72,45 @@ def _likelier(state: State, numerics: Numerics) -> tuple[Assembly, ModelFit] | N
     a power law do.
     """
     steps, base = state.assembly.steps, state.base()
-    several, price = len(steps) > 1, schwarz_price(base)
-    forms = [state.assembly, *(state.assembly.without(step) for step in steps if several)]
+    several = len(steps) > 1
+    less = [state.assembly.without(step) for step in steps if several]
+    less = [form for form in less if form.has_corner]
     others = other_corners(state.assembly.corner)[: None if several or not state.at_floor else 1]
-    best, found = 0.0, None
-    for form in [form for form in forms if form.has_corner]:
-        names = [name for step in form.steps for name in step.amplitudes]
+    # That an effect is not worth its unknowns is no merit of another corner.
+    present = [_against(base, form, state.fit, form.corner, numerics) for form in less]
+    best, found = max([0.0, *(one.worth for one in present)]), None
+    for form in (state.assembly, *less):
         for corner in others:
-            assembly, fit = with_other_corner(base, form, state.fit, corner, numerics)
-            share, changes = compare(base, fit)
-            fall, noise = share * base.fall_back, inflation_along(base, fit, names, changes)
-            reached = base.excess - fall < base.feigned
-            # They are told apart as two effects are.
-            worth = fall + price * (len(base.fit.problem.names) - len(fit.problem.names))
-            if reached and noise and worth - best > base.policy.equal_likelihood * noise.value:
-                best, found = worth, (assembly, fit)
-    return found
+            tried = _against(base, form, state.fit, corner, numerics)
+            if tried.worth - best > base.policy.equal_likelihood:
+                best, found = tried.worth, tried
+    return None if found is None else (found.assembly, found.fit)
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """A model with a corner of friction, its estimate, and how much likelier than the present model
+    it makes the data, in the units of :func:`~bayesoleo.discovery._alternatives.loss_of`; minus
+    infinity where more than noise is left."""
+
+    assembly: Assembly
+    fit: ModelFit
+    worth: float
+
+
+def _against(
+    base: Base, form: Assembly, present: ModelFit, corner: str, numerics: Numerics
+) -> _Tried:
+    assembly, fit = with_other_corner(base, form, present, corner, numerics)
+    share, changes = compare(base, fit)
+    fall = share * base.fall_back
+    names = [name for step in form.steps for name in step.amplitudes]
+    noise = inflation_along(base, fit, names, changes)
+    if noise is None or not base.excess - fall < base.feigned:
+        return _Tried(assembly, fit, -np.inf)
+    # They are told apart as two effects are.
+    saved = len(base.fit.problem.names) - len(fit.problem.names)
+    return _Tried(assembly, fit, fall / noise.value + saved * price_in(base, noise))
 
 
 def other_corners(corner: str) -> list[str]:

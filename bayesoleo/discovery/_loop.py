@@ -556,12 +556,13 @@ def _in_corner(
         turned = cornered(state, roles, numerics, callback)
         if turned is state:
             break
-        notes += [
-            f"{effect} was removed again because it made up for the corner of friction, which is"
-            f" {turned.assembly.corner}"
-            for effect, target in state.assembly.added
-            if (effect, target) not in turned.assembly.added
-        ]
+        gone = [key for key in state.assembly.added if key not in turned.assembly.added]
+        if gone:
+            which = " and ".join(f"{effect} at {target}" for effect, target in gone)
+            notes.append(
+                f"removed again: {which}. With {turned.assembly.corner} as the corner of friction"
+                " nothing is left for that to explain"
+            )
         state = eliminated(turned, before, roles, numerics, notes, callback, last_too=True)
     return state
 

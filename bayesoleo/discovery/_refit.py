@@ -300,6 +300,12 @@ def schwarz_price(base: Base) -> float:
     return float(np.log(sum(run.residual.size for run in base.runs)))
 
 
+def price_in(base: Base, noise: Inflation) -> float:
+    """Price of an unknown in units of the noise along it: the logarithm is that of the effective
+    number of independent samples."""
+    return max(schwarz_price(base) - float(np.log(noise.on_trial)), 1.0)
+
+
 def inflation_along(
     base: Base, fit: ModelFit, names: Sequence[str], changes: Sequence[Array]
 ) -> Inflation | None:

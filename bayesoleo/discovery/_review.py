@@ -243,7 +243,8 @@ def _without_companion(
 
 
 def _added_by(progress: Progress, step: AddedEffect) -> int | None:
-    """Number of the round that added a final effect; None if the other effects are the same now."""
+    """Number of the round that added a final effect; None if the other effects and the corner of
+    friction are the same now."""
     key = step.effect.id, step.target
     for number, item in reversed(list(enumerate(progress.rounds))):
         if item.accepted is not None and (item.accepted.effect, item.accepted.target) == key:

@@ -518,7 +518,10 @@ def product(D: int) -> str:
 
 
 def begin(D: int) -> str:
-    """First states of the chunks, ``(D, WIDTH)``: of a closed period, or from nothing."""
+    """First states of the chunks, ``(D, WIDTH)``: of a closed period, or from nothing.
+
+    What the first solution misses the closure by is solved for once more, as in straight-line code.
+    """
     source = Source("begin", "history, inverse, start, whole, rest, closed")
 
     def outer(*heads: str) -> None:
@@ -549,6 +552,21 @@ def begin(D: int) -> str:
     source.add(f"start[i*{WIDTH} + 1] = y")
     outer("if closed > 0:", f"for i in range({D}):")
     source.add(f"start[i*{WIDTH}] = start[i*{WIDTH} + 1]")
+    states(closed=True, chunks=WIDTH - 1)
+    outer("if closed > 0:", f"for c in range({WIDTH - 1}, {WIDTH}):")
+    source.add(_end_of_chunk(D))
+    source.loop(f"for i in range({D}):")
+    source.add(f"y = {_last_of_chunk(D, 'i', str(D))} - start[i*{WIDTH}]")
+    source.loop(f"for o in range({D}):")
+    source.add(f"y += {_last_of_chunk(D, 'i', 'o')}*start[o*{WIDTH} + c]")
+    source.indent = source.indent[:-4]
+    source.add(f"start[i*{WIDTH} + 1] = y")
+    outer("if closed > 0:", f"for i in range({D}):")
+    source.add(f"y = start[i*{WIDTH}]")
+    source.loop(f"for k in range({D}):")
+    source.add(f"y += inverse[i*{D} + k]*start[k*{WIDTH} + 1]")
+    source.indent = source.indent[:-4]
+    source.add(f"start[i*{WIDTH}] = y")
     states(closed=False, chunks=WIDTH - 1)
     return "\n".join(source.lines)
 

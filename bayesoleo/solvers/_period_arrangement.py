@@ -19,6 +19,7 @@ from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import config
 
 from bayesoleo._compiled import BLOCK, inner, jit
 from bayesoleo._types import Array, Flags, Integers
@@ -31,7 +32,7 @@ from bayesoleo.solvers._unrolled_program import Program, chunks
 LEAST_MOTION = 1e-6
 #: Fewer steps than that leave chunks empty.
 LEAST_STEPS = WIDTH
-#: Bytes of the steps' matrices, which a thread keeps, above which the general iteration, that
+#: Bytes of the steps' matrices, which a thread keeps twice, above which the general iteration, that
 #: eliminates them in groups, solves: a transient of ten dofs has them at thirty thousand steps.
 MOST_BYTES = 5e8
 #: Numbers in a cache line.
@@ -246,7 +247,8 @@ class Sweep(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Addresses of the arrays of one lane at a time, which are allocated once."""
+    """Arrays of one lane at a time, which are allocated once: their addresses for compiled code,
+    their shapes, or themselves."""
 
     now: Any
     base: Any
@@ -270,8 +272,10 @@ class Work(NamedTuple):
 
 
 def can_sweep(program: Program, n: int) -> bool:
-    """Whether there are enough of ``n`` steps for all chunks, and not too many for the memory."""
-    return n >= LEAST_STEPS and 8 * program.transfer * n <= MOST_BYTES
+    """Whether ``n`` steps are enough for all chunks, and not too many for the memory; never where
+    functions are not compiled."""
+    compiled = not getattr(config, "DISABLE_JIT", False)
+    return compiled and n >= LEAST_STEPS and 8 * program.transfer * n <= MOST_BYTES
 
 
 def work_space(sizes: Sizes, order: Sequence[int]) -> Work:

@@ -75,7 +75,7 @@ def swept_columns(
     order = _order_of_steps(program, h.size)
     length = np.ascontiguousarray(h[order.chosen])
     kept = [
-        np.empty(0) if array is None else np.ascontiguousarray(array)
+        np.empty(0) if array is None else np.ascontiguousarray(array, dtype=np.float64)
         for array in (gz, right, x, jumps)
     ]
     places = (0 if array.size == 0 else array.ctypes.data for array in kept)
@@ -113,8 +113,9 @@ class _Order:
     arranged: arrangement.Arranged
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)
 def _order_of_steps(program: Program, n: int) -> _Order:
+    assert program.front == 0, "columns are of collocation, whose steps look at none before them"
     # Lengths that are the steps' numbers say which step stands where.
     nothing, lengths = np.empty((0, n * program.stages)), np.arange(n, dtype=np.float64)
     arranged = arrangement.Arranged.of(program, nothing, lengths)

@@ -182,7 +182,11 @@ def product(new: int, order: Sequence[int]) -> str:
 
 
 def begin(new: int, order: Sequence[int]) -> str:
-    """First states of the chunks, ``(D, WIDTH)``: of a closed period, or from nothing."""
+    """First states of the chunks, ``(D, WIDTH)``: of a closed period, or from nothing.
+
+    What the first solution misses the closure by is solved for once more. An inverse loses as many
+    digits as the period multiplies errors by, and the period itself as many again.
+    """
     D = len(order)
     source = Source("begin", "history, inverse, start, whole, rest, closed")
     states = range(D)
@@ -203,9 +207,14 @@ def begin(new: int, order: Sequence[int]) -> str:
     source.loop("if closed > 0:")
     through_chunks()
     for i in states:
-        source.add(f"n{i} = {joined([f'inverse[{i * D + k}]*s{k}' for k in states])}")
+        source.add(f"x{i} = {joined([f'inverse[{i * D + k}]*s{k}' for k in states])}")
     for i in states:
-        source.add(f"s{i} = n{i}")
+        source.add(f"s{i} = x{i}")
+    through_chunks()
+    for i in states:
+        source.add(f"e{i} = s{i} - x{i}")
+    for i in states:
+        source.add(f"s{i} = x{i} + ({joined([f'inverse[{i * D + k}]*e{k}' for k in states])})")
     source.indent = source.indent[:-4]
     through_chunks(*[f"start[{i * WIDTH} + c] = s{i}" for i in states])
     return "\n".join(source.lines)

@@ -64,6 +64,11 @@ def silent(_: str) -> None:
     """Receives messages."""
 
 
+def white(*_: object) -> SimpleNamespace:
+    """The noise along any change, over white noise."""
+    return SimpleNamespace(value=1.0, on_trial=1.0)
+
+
 def score_of(state: State, name: str = "coulomb_friction") -> Score:
     return scored(state, name)[name]
 
@@ -123,7 +128,9 @@ def test_a_corner_must_be_clearly_likelier(sharp, monkeypatch):
 
     at = base.excess - 0.5 * base.feigned  # noise explains what is left
     monkeypatch.setattr(corners, "compare", fallen)
-    monkeypatch.setattr(corners, "inflation_along", lambda *_: SimpleNamespace(value=1.0))
+    monkeypatch.setattr(
+        corners, "inflation_along", lambda *_: SimpleNamespace(value=1.0, on_trial=1.0)
+    )
     monkeypatch.setattr(corners, "fit_state", lambda assembly, *_, **__: SimpleNamespace(
         assembly=assembly, at_floor=True, worst_ratio=1.0))  # fmt: skip
     found = cornered(first, roles, NUMERICS, silent)
@@ -137,7 +144,9 @@ def test_a_corner_that_leaves_more_than_noise_is_not_taken(sharp, monkeypatch):
     monkeypatch.setattr(
         corners, "compare", lambda *_: ((base.excess - 1.1 * base.feigned) / base.fall_back, [])
     )
-    monkeypatch.setattr(corners, "inflation_along", lambda *_: SimpleNamespace(value=1.0))
+    monkeypatch.setattr(
+        corners, "inflation_along", lambda *_: SimpleNamespace(value=1.0, on_trial=1.0)
+    )
     assert cornered(first, roles, NUMERICS, silent) is first
 
 
@@ -196,7 +205,8 @@ def test_all_effects_are_tested_again_with_another_corner(monkeypatch):
     assert found is without
     assert told == [(turned, "before", True)]
     assert len(notes) == 1
-    assert "stribeck_friction was removed again" in notes[0]
+    assert "stribeck_friction at stroke" in notes[0]
+    assert "coulomb_friction" not in notes[0]
     assert HYPERBOLIC in notes[0]
 
 
@@ -259,6 +269,14 @@ def test_the_corner_is_looked_at_again_when_another_effect_was_added(tmp_path):
     assert found.at_floor
     # It is right now.
     assert cornered(found, roles, NUMERICS, silent) is found
+
+
+@pytest.mark.parametrize("second", ["stribeck_friction", "quadratic_damping"])
+def test_an_effect_too_many_is_no_merit_of_another_corner(round_, second):
+    """With the present corner it is not worth its unknowns either."""
+    both = added(added(round_, "coulomb_friction"), second)
+    assert both.at_floor
+    assert cornered(both, assign(round_.fit.records), NUMERICS, silent) is both
 
 
 @pytest.mark.parametrize("second", ["stribeck_friction", "power_law_damping"])

@@ -105,3 +105,26 @@ def test_rows_that_have_to_be_exchanged_are():
     for lane in range(LANES):
         wanted = factorised(scheme, gz[lane], right[lane], ends, 24)
         np.testing.assert_allclose(dx[lane], wanted, rtol=0, atol=1e-11 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("d", [1, 6])
+@pytest.mark.parametrize("rate", [10.0, 16.0])
+def test_derivatives_of_an_unstable_motion_keep_their_digits(d, rate):
+    """One that grows by 2e4 and by 8e6 in a period: rounding may grow as much, not by its square.
+
+    Straight-line code, and loops over dofs that are not tied to each other."""
+    n, scheme = 100, Collocation(tableau("radau3"), (2,) * d)
+    phase = 2 * np.pi * scheme.phases(n)
+    gz = np.zeros((1, d, 3 * d, phase.size))
+    for j in range(d):
+        gz[0, j, 3 * j] = -(rate**2) * (1 + 0.2 * np.sin(phase))
+        gz[0, j, 3 * j + 1], gz[0, j, 3 * j + 2] = 0.1, 1.0
+    right = np.repeat(np.stack([np.cos(phase), np.sin(2 * phase) + 1])[None, None], d, axis=1)
+    dx, monodromy, ok = scheme.linear(gz, right, None, np.arange(1), 1.0 / n)
+    growth = np.abs(np.linalg.eigvals(monodromy[0])).max()
+    assert growth > 1e4
+    assert ok[0]
+    ends, h = np.zeros((2 * d, 2, n)), scheme.lengths(n, 1.0 / n)
+    wanted = elimination.collocation_step(gz[0], right[0], ends, scheme.method, scheme.orders, h)
+    error = np.abs(dx[0] - wanted).max() / np.abs(wanted).max()
+    assert error < 1e-15 * growth
