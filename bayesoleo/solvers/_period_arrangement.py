@@ -32,7 +32,9 @@ from bayesoleo.solvers._unrolled_program import Program, chunks
 LEAST_MOTION = 1e-6
 #: Fewer steps than that leave chunks empty.
 LEAST_STEPS = WIDTH
-#: Bytes of the steps' matrices, which a thread keeps twice, above which the general iteration, that
+#: Bytes of arrays that a thread keeps, beside those that it uses.
+MOST_KEPT = 32_000_000
+#: Bytes of the steps' matrices, which a thread keeps, above which the general iteration, that
 #: eliminates them in groups, solves: a transient of ten dofs has them at thirty thousand steps.
 MOST_BYTES = 5e8
 #: Numbers in a cache line.
@@ -281,19 +283,24 @@ def can_sweep(program: Program, n: int) -> bool:
 def work_space(sizes: Sizes, order: Sequence[int]) -> Work:
     """Room for lanes of given sizes, whose history has the state in an order.
 
-    A thread keeps what it used last, for solutions and for their derivatives: addresses hold until
-    it asks for two others.
+    A thread keeps what it used last: addresses hold until it asks for others. To allocate anew for
+    every run, where lengths of runs differ, can take half as long as to solve.
     """
     key = sizes, tuple(order)
     rooms: dict[Any, tuple[Work, Work]] = _kept.__dict__.setdefault("rooms", {})
     room = rooms.pop(key, None)
     if room is None:
-        while len(rooms) > 1:
-            del rooms[next(iter(rooms))]
         arrays = _allocate(*key)
+        while rooms and sum(_size(kept) for kept, _ in rooms.values()) + _size(arrays) > MOST_KEPT:
+            del rooms[next(iter(rooms))]
         room = arrays, Work(*[array.ctypes.data for array in arrays])
     rooms[key] = room
     return room[1]
+
+
+def _size(arrays: Work) -> int:
+    """Bytes."""
+    return sum(array.nbytes for array in arrays)
 
 
 def _allocate(sizes: Sizes, order: tuple[int, ...]) -> Work:
