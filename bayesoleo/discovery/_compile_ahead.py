@@ -1,9 +1,7 @@
 """Compilation in a process of its own of what a search needs later, where nothing is compiled yet.
 
-The search itself begins with Newton's iteration and the elimination of sensitivities, which share
-functions, and compiles these. Meanwhile the rest is made in the order in which it is needed. A
-simulation begins with what compares motions with samples; then the other process begins with the
-iteration.
+The search itself begins with Newton's iteration, and a simulation with the elimination of
+sensitivities; each compiles that. Meanwhile the other process compiles what is needed next.
 """
 
 from __future__ import annotations
@@ -15,7 +13,10 @@ import numpy as np
 from bayesoleo._compiled import is_compiled
 from bayesoleo._parallel import available_cores, thread_limit
 from bayesoleo._worker_processes import begin_elsewhere
-from bayesoleo.solvers._collocation import linear
+from bayesoleo.discovery._structure_moments import beside
+from bayesoleo.solvers._collocation import Collocation
+from bayesoleo.solvers._mesh import tableau
+from bayesoleo.solvers._period_arrangement import LEAST_STEPS
 
 if TYPE_CHECKING:
     from bayesoleo.prediction._periodic_run import RunPredictor
@@ -31,21 +32,35 @@ def begin_compiling(jobs: int | None, *, simulated: bool = False) -> None:
     simulated : bool
         The search follows a simulation by this process.
     """
-    if min(thread_limit(), jobs or available_cores()) > 1 and not is_compiled(linear):
-        function = compile_after_simulation if simulated else compile_ahead
-        begin_elsewhere(__name__, function.__name__)
+    if _begun or min(thread_limit(), jobs or available_cores()) < 2 or is_compiled(beside):
+        return
+    function = compile_after_simulation if simulated else compile_ahead
+    _begun.append(function.__name__)
+    begin_elsewhere(__name__, function.__name__)
+
+
+#: What was begun: a search that follows a simulation begins nothing else.
+_begun: list[str] = []
 
 
 def compile_ahead() -> None:
-    """Compile what compares motions with samples, then what is needed later."""
-    _compile_comparison(_oscillator())
-    _compile_late()
+    """Compile what follows Newton's iteration, then the evidence of structures.
+
+    What interpolates a motion is quick to compile, and left to the search.
+    """
+    from bayesoleo.solvers._switching import evaluate, periodic_signal
+
+    run = _oscillator()
+    _compile_columns()
+    run.compare_rest(_constants(run))
+    evaluate(periodic_signal(1.0, np.zeros((1, 1)), np.zeros((1, 1))), np.zeros(1))
+    _compile_evidence()
 
 
 def compile_after_simulation() -> None:
-    """Compile Newton's iteration, then what is needed later."""
+    """Compile Newton's iteration, then the evidence of structures."""
     _compile_iteration(_oscillator())
-    _compile_late()
+    _compile_evidence()
 
 
 def _oscillator() -> RunPredictor:
@@ -75,23 +90,20 @@ def _compile_iteration(run: RunPredictor) -> None:
     solve_periodic(run.boundary, _constants(run), start)
 
 
-def _compile_comparison(run: RunPredictor) -> None:
-    """By a motion that solves nothing, and by the inputs of one."""
-    from bayesoleo.solvers._switching import evaluate, periodic_signal
-
-    run.compare_rest(_constants(run))
-    evaluate(periodic_signal(1.0, np.zeros((1, 1)), np.zeros((1, 1))), np.zeros(1))
+def _compile_columns() -> None:
+    """Sensitivities: as few steps as can be swept."""
+    scheme = Collocation(tableau("radau3"), (2,))
+    points = LEAST_STEPS * scheme.method.stages
+    gz, right = np.ones((1, 1, 3, points)), np.zeros((1, 1, 1, points))
+    scheme.linear(gz, right, None, np.arange(1), 1.0)
 
 
 def _constants(run: RunPredictor) -> np.ndarray:
     return np.ones((1, len(run.kernels.derived.constants)))
 
 
-def _compile_late() -> None:
-    """The evidence of structures, then the elimination of what sweeps cannot solve."""
+def _compile_evidence() -> None:
     # Imported once the rest is compiled: libraries take seconds to load.
     from bayesoleo.discovery._structure_evidence import compile_evidence
-    from bayesoleo.solvers._collocation import compile_exchange
 
     compile_evidence()
-    compile_exchange()

@@ -373,17 +373,13 @@ class RunPredictor:
         return replace(samples, jumped=jumped, monodromy=monodromy)
 
     def compare_rest(self, p: Array) -> PredictedSamples:
-        """Compare rest with the samples in all ways in which solutions are, at constants ``p (1,
-        np)``: what that needs is compiled then."""
+        """Compare rest with the samples as solutions are, at constants ``p (1, np)``, and make it
+        the anchor: what that needs is compiled then."""
         x = np.zeros((1, self.steps, self.scheme.width))
-        x_p, status = np.zeros((*x.shape, len(self.active))), np.zeros(1, dtype=np.int64)
-        moved = np.moveaxis(x_p[0], 2, 0)
+        moved = np.zeros((len(self.active), *x.shape[1:]))
         self.anchor = Anchor(p[0], x[0], moved, np.zeros((self.scheme.state_size,) * 2))
         self.anchor.left_by(np.zeros((1, len(self.active))), x)
-        z = np.empty((1, len(self.kernels.derived.states), len(self.points)))
-        self.scheme.rows(x, np.arange(1), self.boundary.step(self.steps), z)
-        self._at_samples(p, x, None, status, derivatives=False)
-        return self._at_samples(p, x, x_p, status, derivatives=True)
+        return self._at_samples(p, x, None, np.zeros(1, dtype=np.int64), derivatives=False)
 
     def _left(self, p: Array, x: Array, status: Integers, monodromy: Array | None = None) -> Flags:
         """Whether solutions that converged left the anchor's branch, which is counted."""

@@ -21,13 +21,9 @@ from bayesoleo._compiled import BLOCK as POINTS, inner, jit, pointer
 from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.errors import InputError
 from bayesoleo.solvers import _elimination as sparse, _unrolled_program as unrolled
-from bayesoleo.solvers._elimination import close_and_sweep, eliminate_each, eliminate_together
-from bayesoleo.solvers._mesh import Mesh, Tableau, tableau
+from bayesoleo.solvers._mesh import Mesh, Tableau
 from bayesoleo.solvers._period_arrangement import can_sweep
 from bayesoleo.solvers._swept_columns import swept_columns
-
-#: Steps of the mesh whose stages are eliminated together, innermost in memory.
-BLOCK = 32
 
 
 @jit
@@ -179,176 +175,6 @@ def _integrals(
         twice[m] *= h[m] * h[m]
 
 
-@jit
-def linear(
-    gz: Array, right: Array, x: Array, newton: bool, jumps: Array, lanes: Integers, h: Array,
-    a: Array, aa: Array, b: Array, ba: Array, c: Array, orders: Integers, initial: bool, dx: Array,
-    monodromy: Array, ok: Flags,
-) -> None:  # fmt: skip
-    """Eliminate every step's stages, close the period, and recover the stages: of lanes whose rows
-    have to be exchanged, and where there is no code to sweep a scheme."""
-    d, s = orders.size, b.size
-    D, n, k = orders.sum(), dx.shape[1], right.shape[2]
-    size = s * d
-    work, scale = np.empty((size, size + D + k, BLOCK)), np.empty((2, size, BLOCK))
-    stages = np.empty((size, D + k, n))
-    transfer = np.empty((D, D + k, n))
-    states = np.empty((D, k, n))
-    for lane in lanes:
-        good = True
-        for first in range(0, n, BLOCK):
-            count = min(BLOCK, n - first)
-            _assemble(gz[lane], right[lane], first, count, h, a, aa, c, orders, work)
-            if not eliminate_together(work, scale, count, size):
-                _assemble(gz[lane], right[lane], first, count, h, a, aa, c, orders, work)
-                good = good and eliminate_each(work, count, size)
-            for line in range(size):
-                for column in range(D + k):
-                    for t in range(count):
-                        stages[line, column, first + t] = work[line, size + column, t]
-        if good:
-            _transfer(stages, h, b, ba, orders, transfer)
-            if newton:
-                _add_jumps(x[lane], h, b, ba, orders, initial, transfer)
-            if jumps.shape[3] == n:
-                _add_to_last(jumps[lane], transfer)
-            good = close_and_sweep(transfer, monodromy[lane], states, initial)
-        ok[lane] = good
-        if good:
-            _recover(stages, states, dx[lane])
-
-
-@inner
-def _assemble(
-    gz: Array, right: Array, first: int, count: int, h: Array, a: Array, aa: Array, c: Array,
-    orders: Integers, work: Array,
-) -> None:  # fmt: skip
-    """Equations of ``count`` steps: ``work (s d, s d + D + k, block)``, [stages | state, right]."""
-    d, s = orders.size, c.size
-    D, k = orders.sum(), right.shape[1]
-    size = s * d
-    for i in range(s):
-        begin = first * s + i
-        for e in range(d):
-            line = i * d + e
-            row = state = 0
-            for j in range(d):
-                for stage in range(s):
-                    once, twice = a[i, stage], aa[i, stage]
-                    own = 1.0 if stage == i else 0.0
-                    column = stage * d + j
-                    if orders[j] == 1:
-                        for t in range(count):
-                            point = begin + t * s
-                            work[line, column, t] = (
-                                h[first + t] * once * gz[e, row, point]
-                                + own * gz[e, row + 1, point]
-                            )
-                    else:
-                        for t in range(count):
-                            point, length = begin + t * s, h[first + t]
-                            total = length * length * twice * gz[e, row, point]
-                            total += length * once * gz[e, row + 1, point]
-                            work[line, column, t] = total + own * gz[e, row + 2, point]
-                for t in range(count):
-                    work[line, size + state, t] = -gz[e, row, begin + t * s]
-                if orders[j] == 2:
-                    for t in range(count):
-                        point = begin + t * s
-                        work[line, size + state + 1, t] = -(
-                            h[first + t] * c[i] * gz[e, row, point] + gz[e, row + 1, point]
-                        )
-                row += orders[j] + 1
-                state += orders[j]
-            for column in range(k):
-                for t in range(count):
-                    work[line, size + D + column, t] = -right[e, column, begin + t * s]
-
-
-@inner
-def _transfer(
-    stages: Array, h: Array, b: Array, ba: Array, orders: Integers, transfer: Array
-) -> None:
-    """State at the right end of every step from that at the left: ``transfer (D, D + k, n)``."""
-    d, s, n = orders.size, b.size, transfer.shape[2]
-    transfer[:] = 0.0
-    state = 0
-    for j in range(d):
-        last = state + orders[j] - 1
-        transfer[last, last] = 1.0
-        if orders[j] == 2:
-            transfer[state, state] = 1.0
-            for m in range(n):
-                transfer[state, last, m] = h[m]
-        for stage in range(s):
-            for column in range(transfer.shape[1]):
-                for m in range(n):
-                    transfer[last, column, m] += h[m] * b[stage] * stages[stage * d + j, column, m]
-                if orders[j] == 2:
-                    for m in range(n):
-                        transfer[state, column, m] += (
-                            h[m] * h[m] * ba[stage] * stages[stage * d + j, column, m]
-                        )
-        state += orders[j]
-
-
-@inner
-def _add_jumps(
-    x: Array, h: Array, b: Array, ba: Array, orders: Integers, initial: bool, transfer: Array
-) -> None:
-    """Add the jump from each step's end to the next node to the right-hand side (one column).
-
-    A transient's last step has no next node.
-    """
-    d, s, n = orders.size, b.size, x.shape[0]
-    D = orders.sum()
-    state = 0
-    for j in range(d):
-        last = state + orders[j] - 1
-        for m in range(n - 1 if initial else n):
-            following = m + 1 if m + 1 < n else 0
-            once = twice = 0.0
-            for stage in range(s):
-                value = x[m, D + stage * d + j]
-                once += b[stage] * value
-                twice += ba[stage] * value
-            transfer[last, D, m] += x[m, last] + h[m] * once - x[following, last]
-            if orders[j] == 2:
-                transfer[state, D, m] += (
-                    x[m, state] + h[m] * (x[m, last] + h[m] * twice) - x[following, state]
-                )
-        state += orders[j]
-
-
-@inner
-def _add_to_last(source: Array, target: Array) -> None:
-    """Add to the last columns, without slices: see ``_elimination._copy_columns``."""
-    first = target.shape[1] - source.shape[1]
-    for i in range(source.shape[0]):
-        for j in range(source.shape[1]):
-            for m in range(source.shape[2]):
-                target[i, first + j, m] += source[i, j, m]
-
-
-@inner
-def _recover(stages: Array, states: Array, dx: Array) -> None:
-    """Stage unknowns from the node states: ``dx (n, w, k)``."""
-    D, k, n = states.shape
-    total = np.empty(n)
-    for column in range(k):
-        for i in range(D):
-            for m in range(n):
-                dx[m, i, column] = states[i, column, m]
-        for line in range(stages.shape[0]):
-            for m in range(n):
-                total[m] = stages[line, D + column, m]
-            for i in range(D):
-                for m in range(n):
-                    total[m] += stages[line, i, m] * states[i, column, m]
-            for m in range(n):
-                dx[m, D + line, column] = total[m]
-
-
 @dataclass(frozen=True)
 class SamplePlan:
     """Steps of the mesh, positions in them and interpolation weights, each (s, N), of N phases.
@@ -361,13 +187,6 @@ class SamplePlan:
     w0: Array
     w1: Array
     w2: Array
-
-
-def compile_exchange() -> None:
-    """Compile the elimination that exchanges rows, or load it: few models need it, and late."""
-    scheme = Collocation(tableau("radau3"), (2,))
-    gz, right = np.ones((1, 1, 3, scheme.method.stages)), np.zeros((1, 1, 1, scheme.method.stages))
-    scheme.linear(gz, right, None, np.arange(1), 1.0)  # one step is too few to be swept
 
 
 @dataclass(frozen=True)
@@ -578,13 +397,29 @@ class Collocation:
     ) -> None:
         """Solve lanes whose rows may have to be exchanged, into the results."""
         dx, monodromy, ok = results
-        present = np.zeros((1, 1, 1)) if x is None else x
-        added = np.zeros((1, 1, 1, 0)) if jumps is None else jumps
-        method, n = self.method, dx.shape[1]
-        linear(
-            gz, right, present, x is not None, added, lanes, h, method.a, method.a @ method.a,
-            method.b, method.b @ method.a, method.c, self._orders, initial, dx, monodromy, ok,
-        )  # fmt: skip
+        D, n, columns = self.state_size, dx.shape[1], right.shape[2]
+        stages, end = sparse.step_maps(self.method, self.orders, h)
+        own, regular = sparse.eliminate_steps(gz[lanes], right[lanes], stages)
+        transfer = end[:, :, D:] @ own
+        transfer[..., :D] += end[:, :, :D]
+        if jumps is not None:
+            transfer[..., D:] += np.moveaxis(jumps[lanes], 3, 1)
+        if initial and n == 1:  # as of many lanes: steps by themselves
+            monodromy[lanes], ok[lanes] = transfer[:, 0, :, :D], regular
+            dx[lanes, :, D:] = np.where(regular[:, None, None, None], own[..., D:], 0.0)
+            return
+        for i, lane in enumerate(lanes):
+            if x is not None:
+                transfer[i, ..., D] += self._jumps(x[lane], h).T
+            states = np.zeros((D, columns, n))
+            ok[lane] = regular[i] and sparse.close_and_sweep(
+                np.ascontiguousarray(np.moveaxis(transfer[i], 0, 2)), monodromy[lane], states,
+                initial,
+            )  # fmt: skip
+            if ok[lane]:
+                at_nodes = np.moveaxis(states, 2, 0)
+                dx[lane, :, :D] = at_nodes
+                dx[lane, :, D:] = own[i, ..., D:] + own[i, ..., :D] @ at_nodes
         for lane in lanes if not initial else ():
             if sparse.needs_factorisation(bool(ok[lane]), monodromy[lane]):
                 ends = np.zeros((self.state_size, right.shape[2], n))
@@ -592,7 +427,9 @@ class Collocation:
                     ends[:, 0] += self._jumps(x[lane], h)
                 if jumps is not None:
                     ends += jumps[lane]
-                found = sparse.collocation_step(gz[lane], right[lane], ends, method, self.orders, h)
+                found = sparse.collocation_step(
+                    gz[lane], right[lane], ends, self.method, self.orders, h
+                )
                 ok[lane] = found is not None
                 dx[lane] = 0.0 if found is None else found
 

@@ -25,7 +25,7 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from bayesoleo._compiled import inner, jit
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Flags
 from bayesoleo.solvers._mesh import Tableau
 
 #: Part of its digits that a pivot may lose, to cancellation or beside a large multiple of another
@@ -227,7 +227,7 @@ def _copy_columns(source: Array, first: int, target: Array) -> None:
             target[i, j] = source[i, first + j]
 
 
-@inner
+@jit
 def close_and_sweep(transfer: Array, monodromy: Array, states: Array, initial: bool) -> bool:
     """Close the period and run through it once more.
 
@@ -376,6 +376,47 @@ def collocation_step(
                              ends.transpose(2, 0, 1)], axis=1)  # fmt: skip
     found = solve(_matrix(values, lines, columns, n * w), -target.reshape(n * w, k))
     return None if found is None else found.reshape(n, w, k)
+
+
+def eliminate_steps(gz: Array, right: Array, stages: Array) -> tuple[Array, Flags]:
+    """Solve each step's equations for its own unknowns, with exchange of rows.
+
+    Parameters
+    ----------
+    gz, right : ndarray, shapes (L, d, nz, n s) and (L, d, k, n s)
+        Partial derivatives of the equations at the points, and right-hand sides.
+    stages : ndarray, shape (n, s, nz, w)
+        Of :func:`step_maps`.
+
+    Returns
+    -------
+    own : ndarray, shape (L, n, s d, D + k)
+        The unknowns of the stages by the state at the step's left end, and of the right-hand sides.
+    regular : ndarray of bool, shape (L,)
+        Whether all steps of a lane can be solved; else its unknowns are not numbers.
+    """
+    lanes, d, nz, _ = gz.shape
+    n, s, _, w = stages.shape
+    size, D = d * s, w - d * s
+    points = gz.reshape(lanes, d, nz, n, s)
+    whole = np.einsum("lezms,mszw->lmesw", points, stages).reshape(lanes, n, size, w)
+    columns = np.moveaxis(right.reshape(lanes, d, -1, n, s), (3, 1, 4, 2), (1, 2, 3, 4))
+    target = -np.concatenate([whole[..., :D], columns.reshape(lanes, n, size, -1)], axis=3)
+    with np.errstate(all="ignore"):
+        # Rows are equations in different units; scaled alike, their entries are compared as pivots.
+        scale = 1.0 / np.abs(whole[..., D:]).max(axis=3, keepdims=True)
+        own = _solved(scale * whole[..., D:], scale * target)
+    return own, np.isfinite(own[..., :D]).all(axis=(1, 2, 3))
+
+
+def _solved(matrices: Array, right: Array) -> Array:
+    """Solutions of systems ``(..., m, m)``, not numbers where one is singular."""
+    try:
+        return np.linalg.solve(matrices, right)
+    except np.linalg.LinAlgError:
+        if matrices.ndim == 2:
+            return np.full_like(right, np.nan)
+        return np.stack([_solved(*one) for one in zip(matrices, right, strict=True)])
 
 
 def step_maps(method: Tableau, orders: Sequence[int], h: Array) -> tuple[Array, Array]:

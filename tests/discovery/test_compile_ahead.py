@@ -49,7 +49,10 @@ def test_a_comparison_needs_nothing_that_was_not_compiled_ahead():
 @pytest.mark.parametrize(
     ("function", "compiled"),
     [
-        ("compile_ahead", [("_sum_of_squares", "_compare"), *EVIDENCE]),
+        (
+            "compile_ahead",
+            [("_swept_columns", "solve_columns"), ("_sum_of_squares", "_compare"), *EVIDENCE],
+        ),
         ("compile_after_simulation", [("_periodic_newton", "solve_lanes"), *EVIDENCE]),
     ],
 )
@@ -72,7 +75,9 @@ def test_it_is_begun_where_it_helps(monkeypatch, jobs, compiled, begun, simulate
     monkeypatch.setattr(ahead, "begin_elsewhere", lambda *call: asked.append(call))
     monkeypatch.setattr(ahead, "is_compiled", lambda _: compiled)
     monkeypatch.setattr(ahead, "thread_limit", lambda: 2)
+    monkeypatch.setattr(ahead, "_begun", [])
     ahead.begin_compiling(jobs, simulated=simulated)
+    ahead.begin_compiling(jobs)  # the search after a simulation
     assert len(asked) == begun
     for module, name in asked:
         assert callable(getattr(sys.modules[module], name))
