@@ -380,8 +380,9 @@ class Collocation:
         if program is not None and can_sweep(program, n):
             swept_columns(program, gz, right, x, jumps, lanes, h, initial, (dx, monodromy, ok))
             left = lanes[~ok[lanes]]
-        if left.size:
-            self._with_exchange(gz, right, x, left, h, initial, jumps, (dx, monodromy, ok))
+        # Steps by themselves all at once; of lanes of many steps one, whose matrices take memory.
+        for some in left[None] if n == 1 and left.size else left[:, None]:
+            self._with_exchange(gz, right, x, some, h, initial, jumps, (dx, monodromy, ok))
         return dx, monodromy, ok
 
     def _with_exchange(
@@ -404,7 +405,7 @@ class Collocation:
         transfer[..., :D] += end[:, :, :D]
         if jumps is not None:
             transfer[..., D:] += np.moveaxis(jumps[lanes], 3, 1)
-        if initial and n == 1:  # as of many lanes: steps by themselves
+        if initial and n == 1:
             monodromy[lanes], ok[lanes] = transfer[:, 0, :, :D], regular
             dx[lanes, :, D:] = np.where(regular[:, None, None, None], own[..., D:], 0.0)
             return

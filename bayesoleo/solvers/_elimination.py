@@ -395,13 +395,13 @@ def eliminate_steps(gz: Array, right: Array, stages: Array) -> tuple[Array, Flag
     regular : ndarray of bool, shape (L,)
         Whether all steps of a lane can be solved; else its unknowns are not numbers.
     """
-    lanes, d, nz, _ = gz.shape
-    n, s, _, w = stages.shape
+    lanes, d, k, _ = right.shape
+    n, s, nz, w = stages.shape
     size, D = d * s, w - d * s
     points = gz.reshape(lanes, d, nz, n, s)
     whole = np.einsum("lezms,mszw->lmesw", points, stages).reshape(lanes, n, size, w)
-    columns = np.moveaxis(right.reshape(lanes, d, -1, n, s), (3, 1, 4, 2), (1, 2, 3, 4))
-    target = -np.concatenate([whole[..., :D], columns.reshape(lanes, n, size, -1)], axis=3)
+    columns = np.moveaxis(right.reshape(lanes, d, k, n, s), (3, 1, 4, 2), (1, 2, 3, 4))
+    target = -np.concatenate([whole[..., :D], columns.reshape(lanes, n, size, k)], axis=3)
     with np.errstate(all="ignore"):
         # Rows are equations in different units; scaled alike, their entries are compared as pivots.
         scale = 1.0 / np.abs(whole[..., D:]).max(axis=3, keepdims=True)
