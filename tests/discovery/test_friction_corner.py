@@ -271,12 +271,19 @@ def test_the_corner_is_looked_at_again_when_another_effect_was_added(tmp_path):
     assert cornered(found, roles, NUMERICS, silent) is found
 
 
-@pytest.mark.parametrize("second", ["stribeck_friction", "quadratic_damping"])
-def test_an_effect_too_many_is_no_merit_of_another_corner(round_, second):
+@pytest.mark.parametrize(("gain", "taken"), [(0.2, False), (5.9, False), (6.1, True)])
+def test_an_effect_too_many_is_no_merit_of_another_corner(round_, monkeypatch, gain, taken):
     """With the present corner it is not worth its unknowns either."""
-    both = added(added(round_, "coulomb_friction"), second)
-    assert both.at_floor
-    assert cornered(both, assign(round_.fit.records), NUMERICS, silent) is both
+    both = added(added(round_, "coulomb_friction"), "stribeck_friction")
+
+    def against(base, form, fit, corner, numerics):
+        worth = 0.0 if len(form.steps) == 2 else 15.0 + gain * (corner == HYPERBOLIC)
+        return corners._Tried(form.with_corner(corner), fit, worth)
+
+    monkeypatch.setattr(corners, "_against", against)
+    found = corners._likelier(both, NUMERICS)
+    assert (found is not None) == taken
+    assert not taken or found[0].corner == HYPERBOLIC
 
 
 @pytest.mark.parametrize("second", ["stribeck_friction", "power_law_damping"])
