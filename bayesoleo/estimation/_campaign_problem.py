@@ -195,20 +195,13 @@ class CampaignProblem:
     def _misfit_of_the_kept(self, theta: Array) -> Misfit:
         """The same where some samples do not count: by way of the residuals."""
         sums = np.full((len(theta), len(self.runs), len(self.outputs)), np.nan)
-        status = np.zeros((len(theta), len(self.runs)), dtype=np.int64)
-        blocks = [
-            (r, slice(k, min(k + _LANES, len(theta))))
-            for r in range(len(self.runs))
-            for k in range(0, len(theta), _LANES)
-        ]
 
-        def work(block: tuple[int, slice]) -> None:
-            r, rows = block
-            residual, status[rows, r] = self.residuals(theta[rows], r)
-            sums[rows, r] = np.sum(residual**2, axis=2)
+        def squares(r: int, lanes: Integers) -> Integers:
+            residual, status = self.residuals(theta[lanes], r)
+            sums[lanes, r] = np.sum(residual**2, axis=2)
+            return status
 
-        thread_map(work, blocks, self.predictor.jobs)
-        worst = status.max(axis=1)
+        worst = self.predictor.by_blocks(len(theta), _LANES, squares)
         sums[worst != Status.CONVERGED] = np.nan
         return Misfit(sums, worst)
 

@@ -17,7 +17,7 @@ from typing import Protocol, cast
 import numpy as np
 
 from bayesoleo import _schema as schema
-from bayesoleo._parallel import thread_map
+from bayesoleo._parallel import available_cores, thread_map
 from bayesoleo._types import Array, Float, Integers
 from bayesoleo.error_models._base import ErrorModel
 from bayesoleo.error_models._registry import error_model
@@ -32,7 +32,8 @@ from bayesoleo.estimation._problem import (
 )
 from bayesoleo.model._correlated_priors import log_density_of, sample_of
 from bayesoleo.model._priors import Prior, Transforms
-from bayesoleo.solvers._orbit import Status
+from bayesoleo.posterior._same_unknowns import Block, SameUnknowns
+from bayesoleo.solvers._orbit import Status, first_failure
 
 #: Finite-difference step in prior standard deviations.
 STEP = 0.25
@@ -425,8 +426,10 @@ class LogDensity:
             return self.unknowns.log_prior(block) + self.errors.log_prior(eta)
 
     def _of_sums(self, theta: Array, eta: Array) -> tuple[Array, Integers]:
-        misfit = self._misfit(theta)
-        return self.errors.of_sums(misfit.sum_of_squares, eta), misfit.status
+        same = SameUnknowns.of(theta)
+        misfit = self._misfit(same.theta)
+        sums = misfit.sum_of_squares[same.of_row]
+        return self.errors.of_sums(sums, eta), misfit.status[same.of_row]
 
     def _misfit(self, theta: Array) -> Misfit:
         if self.jobs is None or self.jobs <= 1 or len(theta) < 2:
@@ -439,45 +442,52 @@ class LogDensity:
         )
 
     def _of_residuals(self, theta: Array, eta: Array) -> tuple[Array, Integers]:
-        """Log-likelihood by run (W, N) and statuses (W,), in blocks of runs and rows."""
-        if self.errors.over_runs:
-            return self._of_all_residuals(theta, eta)
-        problem, count = cast(ResidualProblem, self.problem), len(theta)
-        by_run = np.full((count, len(self.runs)), np.nan)
-        status = np.zeros(by_run.shape, dtype=np.int64)
-        blocks = [
-            (run, slice(k, min(k + LANES, count)))
-            for run in range(len(self.runs))
-            for k in range(0, count, LANES)
-        ]
+        """Log-likelihood by run (W, N) and statuses (W,), in blocks of rows; where these are few
+        and runs do not depend on each other, of single runs."""
+        same, runs = SameUnknowns.of(theta), range(len(self.runs))
+        by_run = np.full((len(theta), len(runs)), np.nan)
+        status = np.zeros((len(theta), len(runs)), dtype=np.int64)
+        blocks = same.blocks(LANES)
+        together = self.errors.over_runs or len(blocks) >= available_cores()
+        parts: list[Sequence[int]] = [runs] if together else [(run,) for run in runs]
 
-        def work(task: tuple[int, slice]) -> None:
-            run, rows = task
-            residual, status[rows, run] = problem.residuals(theta[rows], run)
+        def work(task: tuple[Sequence[int], Block]) -> None:
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                by_run[rows, run] = self.errors.of_run(run, residual, eta[rows])
+                self._of_block(*task, same.theta, eta, by_run, status)
 
-        thread_map(work, blocks, self.jobs)
-        return by_run, status.max(axis=1)
+        thread_map(work, [(part, block) for part in parts for block in blocks], self.jobs)
+        return by_run, first_failure(status)
 
-    def _of_all_residuals(self, theta: Array, eta: Array) -> tuple[Array, Integers]:
-        """The same for errors that runs share, in blocks of rows."""
-        problem, count = cast(ResidualProblem, self.problem), len(theta)
-        by_run = np.full((count, len(self.runs)), np.nan)
-        status = np.zeros(by_run.shape, dtype=np.int64)
-
-        def work(rows: slice) -> None:
-            found = []
-            for run in range(len(self.runs)):
-                residual, status[rows, run] = problem.residuals(theta[rows], run)
+    def _of_block(
+        self,
+        runs: Sequence[int],
+        block: Block,
+        theta: Array,
+        eta: Array,
+        by_run: Array,
+        status: Integers,
+    ) -> None:
+        """Write the log-likelihoods and statuses of a block; a row that has no solution of one run
+        needs none of those after it."""
+        problem, errors = cast(ResidualProblem, self.problem), self.errors
+        found: list[Array] = []
+        for run in runs:
+            residual, failed = problem.residuals(theta[block.lanes], run)
+            if failed.any():
+                status[block.rows, run] = failed[block.of_row]
+                good = failed == Status.CONVERGED
+                block, residual = block.only(good), residual[good]
+                found = [part[good] for part in found]
+            if not block.rows.size:
+                return
+            if errors.over_runs:
                 found.append(residual)
-            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                by_run[rows] = self.errors.of_runs(found, eta[rows])
-
-        thread_map(
-            work, [slice(k, min(k + LANES, count)) for k in range(0, count, LANES)], self.jobs
-        )
-        return by_run, status.max(axis=1)
+            else:
+                rows = block.rows
+                by_run[rows, run] = errors.of_run(run, block.by_row(residual), eta[rows])
+        if found:
+            by_row = [block.by_row(part) for part in found]
+            by_run[block.rows] = errors.of_runs(by_row, eta[block.rows])
 
     def _mark_failures(self, total: Array, by_run: Array, status: Integers) -> tuple[Array, Array]:
         status[(status == Status.CONVERGED) & ~np.isfinite(total)] = Status.NOT_FINITE

@@ -300,7 +300,9 @@ class RunPredictor:
         change = p[:, self.active] - anchor.p[self.active]
         extrapolation, compiled = anchor.extrapolation, self.boundary.arranged is not None
         most = FIRST_DAMPED if compiled else DAMPED_STEPS
-        solution = solve_extrapolated(self.boundary, p, extrapolation, change, max_iterations=most)
+        solution = solve_extrapolated(
+            self.boundary, p, extrapolation, change, max_iterations=most, exchange=self._exchanges
+        )
         if compiled:
             solution = self._once_more(p, solution, change, undamped=True)
             solution = self._once_more(p, solution, change, undamped=False)
@@ -324,7 +326,7 @@ class RunPredictor:
         trial = solve_periodic(
             self.boundary, p[failed], start, overwrite=True,
             max_iterations=WHOLE_STEPS if undamped else DAMPED_STEPS,
-            monotone=not undamped, exchange=not undamped,
+            monotone=not undamped, exchange=not undamped and self._exchanges,
         )  # fmt: skip
         found = trial.status == Status.CONVERGED.value
         if undamped:
@@ -335,13 +337,19 @@ class RunPredictor:
         return replace(solution, x=x, status=status)
 
     def _along_path(self, p: Array, solution: Solution, lane: int, pieces: int) -> Solution:
-        """Walk from the anchor to one lane's parameters in equal pieces."""
+        """Walk from the anchor to one lane's parameters in equal pieces.
+
+        What is only compared is not led by where rows have to be exchanged: the way to a mirrored
+        vector goes through equations without an answer, and takes a hundred times as long.
+        """
         anchor = self.anchor
         assert anchor is not None
         x = anchor.x[None]
         for fraction in np.linspace(0.0, 1.0, pieces + 1)[1:]:
             between = anchor.p + fraction * (p[lane] - anchor.p)
-            trial = solve_periodic(self.boundary, between[None], x, max_iterations=15)
+            trial = solve_periodic(
+                self.boundary, between[None], x, max_iterations=15, exchange=self.watched
+            )
             if trial.status[0] != Status.CONVERGED.value:
                 return solution
             x = trial.x

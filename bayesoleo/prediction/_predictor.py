@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesoleo._parallel import thread_map
+from bayesoleo._parallel import available_cores, thread_map
 from bayesoleo._types import Array, Float, Int, Integers
 from bayesoleo.errors import ModelError
 from bayesoleo.model._drive_and_start import start_parameters
@@ -23,11 +23,13 @@ from bayesoleo.prediction._periodic_run import PredictedSamples, RunPredictor
 from bayesoleo.prediction._periodic_solver import SolvedRun
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._transient_run import TransientRun
-from bayesoleo.solvers._orbit import Status
+from bayesoleo.solvers._orbit import Status, first_failure
 from bayesoleo.solvers._schemes import COLLOCATION, DEFAULT_SCHEME
 
 #: Parameter vectors of one task: enough to share a run's inputs, few enough to stay in the cache.
 BLOCK = 32
+#: Fewest of them where a smaller task would serve more threads.
+LEAST = 4
 
 
 @dataclass(frozen=True)
@@ -349,25 +351,56 @@ class Predictor:
     ) -> tuple[Float[Array, "vectors runs outputs"], Int[Integers, " vectors"]]:
         """Sums of squared residuals, shape (L, N, ny), and the status of each vector, shape (L,).
 
-        The work is cut into blocks of runs and vectors; every vector's result is computed from its
-        own lane in a fixed order, so neither the cut nor the threads change a bit of it.
+        Every vector's result is computed from its own lane in a fixed order, so neither the cut
+        into blocks nor the threads change a bit of it.
         """
-        count, runs = theta.shape[0], len(self.runs)
-        total = np.full((count, runs, len(self.outputs)), np.nan)
-        status = np.zeros((count, runs), dtype=np.int64)
-        blocks = [
-            (r, slice(k, min(k + BLOCK, count)))
-            for r in range(runs)
-            for k in range(0, count, BLOCK)
-        ]
+        total = np.full((len(theta), len(self.runs), len(self.outputs)), np.nan)
 
-        def work(task: tuple[int, slice]) -> None:
-            r, block = task
-            total[block, r], status[block, r] = self.runs[r].squares(
-                self.constants(theta[block], r)
-            )
+        def squares(r: int, lanes: Integers) -> Integers:
+            total[lanes, r], status = self.runs[r].squares(self.constants(theta[lanes], r))
+            return status
 
-        thread_map(work, blocks, self.jobs)
-        worst = status.max(axis=1, initial=0)
+        worst = self.by_blocks(len(theta), BLOCK, squares)
         total[worst != Status.CONVERGED.value] = np.nan
         return total, worst
+
+    def by_blocks(
+        self, count: int, size: int, solve: Callable[[int, Integers], Integers]
+    ) -> Int[Integers, " vectors"]:
+        """Solve blocks of vectors in threads; where there are few, of single runs.
+
+        A vector that has no solution of one run is left out of those after it.
+
+        Parameters
+        ----------
+        count : int
+            Number of vectors.
+        size : int
+            Vectors of a block at most.
+        solve : callable
+            Of a run's number and numbers of vectors, (L,), their statuses, (L,).
+
+        Returns
+        -------
+        ndarray of int, shape (count,)
+            The first failure of each vector: it does not depend on the blocks.
+        """
+        status = np.zeros((count, len(self.runs)), dtype=np.int64)
+        jobs = self.jobs or available_cores()
+        # Some take a hundred times as long as others: several blocks for each thread.
+        size = min(size, max(LEAST, -(-count // (2 * jobs))))
+        blocks = [np.arange(k, min(k + size, count)) for k in range(0, count, size)]
+        every = range(len(self.runs))
+        together = len(blocks) >= jobs
+        parts: list[Sequence[int]] = [every] if together else [(r,) for r in every]
+
+        def work(task: tuple[Sequence[int], Integers]) -> None:
+            runs, lanes = task
+            for r in runs:
+                if not lanes.size:
+                    return
+                status[lanes, r] = solve(r, lanes)
+                lanes = lanes[status[lanes, r] == Status.CONVERGED.value]
+
+        thread_map(work, [(runs, block) for runs in parts for block in blocks], self.jobs)
+        return first_failure(status)

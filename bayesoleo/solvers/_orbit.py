@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesoleo._types import Array, Complex, ComplexArray, Float
+from bayesoleo._types import Array, Complex, ComplexArray, Float, Int, Integers
 
 
 class Status(IntEnum):
@@ -52,6 +52,15 @@ _MESSAGES = {
     Status.TOLERANCE_NOT_MET: "the error stays above the tolerance on the finest mesh allowed",
     Status.NO_ERROR_ESTIMATE: "the iteration converged, but its error could not be estimated",
 }
+
+
+def first_failure(status: Int[Integers, "vectors runs"]) -> Int[Integers, " vectors"]:
+    """Of each vector the first status that is not ``CONVERGED``, shape (L,), of those of its runs,
+    shape (L, N)."""
+    if not status.shape[1]:
+        return np.full(len(status), int(Status.CONVERGED))
+    first = (status != Status.CONVERGED).argmax(axis=1)
+    return np.asarray(status[np.arange(len(status)), first])
 
 
 def count(statuses: Iterable[int] | ArrayLike) -> dict[str, int]:

@@ -212,11 +212,9 @@ def solve_periodic(
     if problem.arranged is None:
         return _Newton(problem, p, x, max_iterations, monotone).run()
     solution = _compiled(problem, problem.arranged, p, x, max_iterations, monotone)
-    if not exchange:
-        solution.status[solution.status == NEEDS_EXCHANGE] = Status.NO_CONVERGENCE.value
-        return solution
     # Those left over are still where they started.
-    return _with_exchange(problem, p, solution, x.__getitem__, max_iterations, monotone)
+    starts = x.__getitem__
+    return _exchanging(problem, p, solution, starts, max_iterations, monotone, exchange)
 
 
 def solve_extrapolated(
@@ -226,6 +224,7 @@ def solve_extrapolated(
     change: Array,
     *,
     max_iterations: int = 40,
+    exchange: bool = True,
 ) -> Solution:
     """The same from ``extrapolation.starts(change)``, ``change (L, na)``, without making them."""
     arranged, most = problem.arranged, max_iterations
@@ -238,9 +237,11 @@ def solve_extrapolated(
     places = base.ctypes.data, slopes.ctypes.data, moved.ctypes.data
     line = arrangement.LinearStart(*places, moved.shape[1])
     solution = _compiled(problem, arranged, p, x, most, True, line)
-    return _with_exchange(
-        problem, p, solution, lambda lanes: extrapolation.starts(change[lanes]), most, True
-    )
+
+    def starts(lanes: Integers) -> Array:
+        return extrapolation.starts(change[lanes])
+
+    return _exchanging(problem, p, solution, starts, most, True, exchange)
 
 
 def solve_from_state(problem: Boundary, p: Array, start: Array, most: int) -> Solution | None:
@@ -270,17 +271,20 @@ def solve_from_state(problem: Boundary, p: Array, start: Array, most: int) -> So
     return _compiled(problem, problem.arranged, p, start.copy(), most, False, initial=True)
 
 
-def _with_exchange(
+def _exchanging(
     problem: Boundary,
     p: Array,
     solution: Solution,
     starts: Callable[[Integers], Array],
     max_iterations: int,
     monotone: bool,
+    exchange: bool,
 ) -> Solution:
-    """Solve by the general iteration what the compiled one cannot eliminate."""
+    """Solve by the general iteration what the compiled one cannot eliminate, if that is wanted."""
     again = np.flatnonzero(solution.status == NEEDS_EXCHANGE)
-    if again.size:
+    if not exchange:
+        solution.status[again] = Status.NO_CONVERGENCE.value
+    elif again.size:
         other = _Newton(problem, p[again], starts(again), max_iterations, monotone).run()
         solution.x[again] = other.x
         solution.status[again], solution.iterations[again] = other.status, other.iterations
