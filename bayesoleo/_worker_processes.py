@@ -383,6 +383,57 @@ class StandingCall[S, T, R]:
         _in_use.release()
 
 
+class Beside[S, R]:
+    """One long call that another process does while this one goes on.
+
+    Where no process is free, or one is lost, the call is done here when its result is asked for.
+
+    Parameters
+    ----------
+    function : callable
+        Of a module, so that another process finds it.
+    argument : object
+        Its only argument.
+    jobs : int, optional
+        As of :func:`process_map`; with one nothing is done beside.
+    """
+
+    def __init__(self, function: Callable[[S], R], argument: S, jobs: int | None = None) -> None:
+        jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
+        self._function, self._argument = function, argument
+        self._found: list[tuple[str, Any]] = []
+        self._thread: threading.Thread | None = None
+        if jobs > 1 and _usable() and _in_use.acquire(blocking=False):
+            self._thread = threading.Thread(target=self._ask, daemon=True)
+            self._thread.start()
+
+    def _ask(self) -> None:
+        try:
+            worker = _worker(0)
+            worker.ask(_sent((_called, self._function, None)))
+            self._found.append(worker.ask(_sent((0, self._argument))))
+            worker.ask(_dumps((None, None, None)))  # it needs no memory until the next call
+        except _LostError:
+            _forget(0)
+        finally:
+            _in_use.release()
+
+    def result(self) -> R:
+        """What came of it, or the exception that it raised, when it is done."""
+        if self._thread is not None:
+            self._thread.join()
+        if not self._found:
+            self._found.append((_VALUE, self._function(self._argument)))
+        kind, value = self._found[0]
+        if kind == _ERROR:
+            raise value
+        return cast(R, value)
+
+
+def _called(function: Callable[[Any], Any], argument: Any) -> Any:
+    return function(argument)
+
+
 # -- processes ------------------------------------------------------------------------------------
 
 _workers: dict[int, _Worker] = {}

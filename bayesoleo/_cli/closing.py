@@ -266,7 +266,7 @@ def demo(
     from bayesoleo.discovery._compile_ahead import begin_compiling
 
     shell.check_writable(out)
-    begin_compiling(chosen.jobs, simulated=True)
+    begin_compiling(chosen.jobs)
     chosen = replace(chosen, quick=not full)
     with shell.stoppable(out, quiet) as told:
         told["callback"]("simulating a shaker campaign of an oleo")

@@ -16,7 +16,7 @@ from pathlib import Path
 import xarray as xr
 
 from bayesoleo._types import ProgressCallback
-from bayesoleo._worker_processes import start_ahead
+from bayesoleo._worker_processes import Beside, start_ahead
 from bayesoleo._workflow.estimating import NOT_SAMPLED, draw, inference_for
 from bayesoleo._workflow.output import (
     POSTERIOR_STAGE,
@@ -34,10 +34,18 @@ from bayesoleo._workflow.output import (
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import Source, Task, prepare, silent
 from bayesoleo.discovery._inference import CATALOGUE
-from bayesoleo.discovery._loop import ClosedLoop, close_loop, loop_of
+from bayesoleo.discovery._loop import (
+    ClosedLoop,
+    close_loop,
+    judged,
+    loop_of,
+    structures_beside,
+)
 from bayesoleo.discovery._next_experiment import check_aim
+from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._open_questions import Question, questions_of
 from bayesoleo.discovery._round import Progress
+from bayesoleo.discovery._structures import StructurePosterior, StructurePrior
 from bayesoleo.discovery._work import QUICK
 from bayesoleo.effects._catalogue import catalogue, catalogue_titles, with_titles
 from bayesoleo.error_models._registry import AUTO
@@ -126,15 +134,48 @@ def close(
     _check_aim(task)
     with output.alone():
         stages, begun = Stages(callback), time.monotonic()
-        loop, questions = search(task, settings.max_effects, stages, output, resume=True)
-        if not settings.quick or time.monotonic() - begun > WORTH_KEEPING:
+        loop = run_loop(
+            task, settings.max_effects, stages, output, resume=True, leave_structures=settings.quick
+        )
+        structures, place = structures_later(task, loop), output.checkpoints
+        keep = not settings.quick or time.monotonic() - begun > WORTH_KEEPING
+        if keep:
+            loop, questions = with_structures(task, loop, structures, stages)
             _write_found(task, loop, output, stages, questions)
         callback("sample the posterior")
-        place = output.checkpoints
         drawn = stages.attempt(
             POSTERIOR_STAGE, lambda: draw_final(task, loop, place, callback, progress), lambda: None
         )
+        if not keep:
+            loop, questions = with_structures(task, loop, structures, stages)
         return written(task, loop, drawn, output, stages, questions)
+
+
+Structures = Beside[tuple[Progress, Numerics, StructurePrior], StructurePosterior | str | None]
+
+
+def structures_later(task: Task, loop: ClosedLoop) -> Structures | None:
+    """The probabilities of structures, computed in another process; None where the loop has them,
+    or there are none. The draws do not depend on them."""
+    progress, settings = loop.without_structures, task.settings
+    if progress is None:
+        return None
+    given = progress, settings.numerics, settings.structure_prior
+    return Beside(structures_beside, given, settings.jobs)
+
+
+def with_structures(
+    task: Task, loop: ClosedLoop, structures: Structures | None, stages: Stages
+) -> tuple[ClosedLoop, tuple[Question, ...]]:
+    """The loop with the probabilities, and the runs that would tell apart what is left."""
+    if structures is not None:
+        stages.callback("compare structures")
+        try:
+            loop = judged(loop, structures.result())
+        except Exception as error:
+            assert loop.without_structures is not None
+            loop = _broken_off(loop.without_structures, task, stages, error)
+    return loop, asked(task, loop, stages)
 
 
 def draw_final(
@@ -221,14 +262,25 @@ def search(
 ) -> tuple[ClosedLoop, tuple[Question, ...]]:
     """The loop of :func:`run_loop`, and the runs that would tell apart what it could not."""
     loop = run_loop(task, max_effects, stages, output, resume=resume)
+    return loop, asked(task, loop, stages)
+
+
+def asked(task: Task, loop: ClosedLoop, stages: Stages) -> tuple[Question, ...]:
+    """What the loop leaves open, with the runs that would tell."""
     if not loop.complete:
-        return loop, ()  # what it would have found is not among what a run were to tell apart
+        return ()  # what it would have found is not among what a run were to tell apart
     ask = partial(what_next, task, loop, stages.callback)
-    return loop, stages.attempt(PROPOSALS_STAGE, ask, no_questions)
+    return stages.attempt(PROPOSALS_STAGE, ask, no_questions)
 
 
 def run_loop(
-    task: Task, max_effects: int, stages: Stages, output: ResultFolder, *, resume: bool = False
+    task: Task,
+    max_effects: int,
+    stages: Stages,
+    output: ResultFolder,
+    *,
+    resume: bool = False,
+    leave_structures: bool = False,
 ) -> ClosedLoop:
     """Rounds until nothing is missing, or nothing helps; the posterior is not sampled.
 
@@ -244,6 +296,8 @@ def run_loop(
         Written to after the estimate and after each round.
     resume : bool
         Whether to keep how far the search has come, and to go on from there.
+    leave_structures : bool
+        Whether to leave their probabilities to :func:`with_structures`.
 
     Raises
     ------
@@ -284,14 +338,20 @@ def run_loop(
             keep=keep,
             keep_columns=max_effects > 0 and settings.inference.error_model in (AUTO, CATALOGUE),
             declared=task.declared,
+            leave_structures=leave_structures,
             callback=callback,
         )
     except Exception as error:
         if not reached:
             raise
-        reason = reason_of(error)
-        stages.fail(SEARCH_STAGE, reason, error)
-        return loop_of(reached[-1].ended(f"the search broke off here: {reason}"), task.roles)
+        return _broken_off(reached[-1], task, stages, error)
+
+
+def _broken_off(reached: Progress, task: Task, stages: Stages, error: Exception) -> ClosedLoop:
+    """What a search had found when it failed."""
+    reason = reason_of(error)
+    stages.fail(SEARCH_STAGE, reason, error)
+    return loop_of(reached.ended(f"the search broke off here: {reason}"), task.roles)
 
 
 def write_so_far(

@@ -517,6 +517,9 @@ def _simulate(model: Model, test: _Test, rng: np.random.Generator) -> SimulatedR
         group=test.group,
         role=test.role,
     )
-    made = simulate_run(model, plan, noise=NOISE, quantisation=QUANTISATION, rng=rng)
+    # By the kernels that the search needs next.
+    made = simulate_run(
+        model, plan, noise=NOISE, quantisation=QUANTISATION, rng=rng, backend="numba"
+    )
     units = {name: item.unit for name, item in model.conditions.items()}
     return replace(to_simulated_run(made, units), frequency=test.frequency)

@@ -1,7 +1,8 @@
 """Compilation in a process of its own of what a search needs later, where nothing is compiled yet.
 
-The search itself begins with Newton's iteration, and a simulation with the elimination of
-sensitivities; each compiles that. Meanwhile the other process compiles what is needed next.
+The search itself begins with Newton's iteration and the elimination of sensitivities, which is
+mostly the iteration's own, and compiles these. Meanwhile the other process compiles what is needed
+next.
 """
 
 from __future__ import annotations
@@ -14,53 +15,40 @@ from bayesoleo._compiled import is_compiled
 from bayesoleo._parallel import available_cores, thread_limit
 from bayesoleo._worker_processes import begin_elsewhere
 from bayesoleo.discovery._structure_moments import beside
-from bayesoleo.solvers._collocation import Collocation
-from bayesoleo.solvers._mesh import tableau
-from bayesoleo.solvers._period_arrangement import LEAST_STEPS
 
 if TYPE_CHECKING:
     from bayesoleo.prediction._periodic_run import RunPredictor
 
 
-def begin_compiling(jobs: int | None, *, simulated: bool = False) -> None:
+def begin_compiling(jobs: int | None) -> None:
     """Begin in another process with what has to be compiled, where nothing is yet.
 
     Parameters
     ----------
     jobs : int, optional
         How many may work at once; alone nothing is begun.
-    simulated : bool
-        The search follows a simulation by this process.
     """
     if _begun or min(thread_limit(), jobs or available_cores()) < 2 or is_compiled(beside):
         return
-    function = compile_after_simulation if simulated else compile_ahead
-    _begun.append(function.__name__)
-    begin_elsewhere(__name__, function.__name__)
+    _begun.append(compile_ahead.__name__)
+    begin_elsewhere(__name__, compile_ahead.__name__)
 
 
-#: What was begun: a search that follows a simulation begins nothing else.
+#: What was begun: a search that follows a simulation begins nothing again.
 _begun: list[str] = []
 
 
 def compile_ahead() -> None:
-    """Compile what follows Newton's iteration, then the evidence of structures.
-
-    What interpolates a motion is quick to compile, and left to the search.
-    """
+    """Compile what follows the first solution, then the evidence of structures, then what scores
+    need for equations that are not compiled: by then the search has the elimination."""
     from bayesoleo.solvers._switching import evaluate, periodic_signal
 
     run = _oscillator()
-    _compile_columns()
+    run.sample_rest(_constants(run))
     run.compare_rest(_constants(run))
     evaluate(periodic_signal(1.0, np.zeros((1, 1)), np.zeros((1, 1))), np.zeros(1))
     _compile_evidence()
-
-
-def compile_after_simulation() -> None:
-    """Compile Newton's iteration, then the evidence of structures."""
-    _compile_iteration(_oscillator())
-    _compile_evidence()
+    _compile_batches(run)
 
 
 def _oscillator() -> RunPredictor:
@@ -83,23 +71,19 @@ def _oscillator() -> RunPredictor:
     return Predictor(model, [record], jobs=1).runs[0]
 
 
-def _compile_iteration(run: RunPredictor) -> None:
-    from bayesoleo.solvers._periodic import solve_periodic
-
-    start = np.zeros((1, run.steps, run.scheme.width))
-    solve_periodic(run.boundary, _constants(run), start)
-
-
-def _compile_columns() -> None:
-    """Sensitivities: as few steps as can be swept."""
-    scheme = Collocation(tableau("radau3"), (2,))
-    points = LEAST_STEPS * scheme.method.stages
-    gz, right = np.ones((1, 1, 3, points)), np.zeros((1, 1, 1, points))
-    scheme.linear(gz, right, None, np.arange(1), 1.0)
-
-
 def _constants(run: RunPredictor) -> np.ndarray:
     return np.ones((1, len(run.kernels.derived.constants)))
+
+
+def _compile_batches(run: RunPredictor) -> None:
+    from bayesoleo.solvers._elimination import close_and_sweep
+    from bayesoleo.solvers._periodic import solve_in_batch
+
+    assert run.anchor is not None
+    start = run.anchor.predict(np.zeros((1, len(run.active))))
+    solve_in_batch(run.boundary, _constants(run), start, most=1)
+    one = np.zeros((1, 1, 1))
+    close_and_sweep(np.zeros((1, 2, 1)), one[0], one, False)
 
 
 def _compile_evidence() -> None:

@@ -191,6 +191,8 @@ class ClosedLoop:
     structures : StructurePosterior or None
         Probabilities of what the declared model lacks; None where no candidate was scored, or the
         search was stopped early.
+    without_structures : Progress or None
+        The search that :func:`structures_of` would compare, where that was left to the caller.
     """
 
     rounds: tuple[Round, ...]
@@ -201,6 +203,7 @@ class ClosedLoop:
     complete: bool = True
     policy: SearchPolicy = SearchPolicy()
     structures: StructurePosterior | None = None
+    without_structures: Progress | None = None
 
     @property
     def added(self) -> tuple[tuple[str, str], ...]:
@@ -313,6 +316,7 @@ def close_loop(
     keep: Callable[[Progress], None] = lambda _: None,
     keep_columns: bool = False,
     declared: ModelFit | None = None,
+    leave_structures: bool = False,
     callback: ProgressCallback = lambda _: None,
 ) -> ClosedLoop:
     """Fit a model and add the effects that it lacks, one after the other.
@@ -348,6 +352,9 @@ def close_loop(
     declared : ModelFit, optional
         The declared model's estimate, if it was made before: by :func:`fit_model`, by these runs
         and numerics.
+    leave_structures : bool
+        Whether the caller compares structures, by :func:`structures_of` and :func:`judged`: no
+        estimate depends on it.
     callback : callable
         Receives a message at each step.
 
@@ -380,16 +387,41 @@ def close_loop(
         # What it would have found is not among what probabilities are of.
         return loop_of(known.ended(ENDED), roles)
     known = best_of_beam(known, roles, numerics, follow, effects, max_effects, callback)
-    loop = loop_of(known, roles)
+    loop = replace(loop_of(known, roles), without_structures=known)
+    if leave_structures:
+        return loop
+    return judged(loop, structures_of(known, numerics, prior, callback))
+
+
+def judged(loop: ClosedLoop, found: StructurePosterior | str | None) -> ClosedLoop:
+    """A loop with what :func:`structures_of` found."""
+    if isinstance(found, str):  # what was found stands without them
+        return replace(loop, notes=(*loop.notes, found), without_structures=None)
+    return replace(loop, structures=found, without_structures=None)
+
+
+def structures_of(
+    progress: Progress,
+    numerics: Numerics,
+    prior: StructurePrior = DEFAULT_PRIOR,
+    callback: ProgressCallback = lambda _: None,
+) -> StructurePosterior | str | None:
+    """The result of :func:`probabilities`, or a note why there is none."""
     try:
-        structures = probabilities(known, numerics, prior, callback)
+        return probabilities(progress, numerics, prior, callback)
     except (np.linalg.LinAlgError, ArithmeticError, ValueError) as error:
         numerical = isinstance(error, np.linalg.LinAlgError | ArithmeticError)
         if not numerical and NOT_FINITE not in str(error):
             raise
-        # What was found stands without them.
-        return replace(loop, notes=(*loop.notes, f"{NO_PROBABILITIES}: {error}"))
-    return replace(loop, structures=structures)
+        return f"{NO_PROBABILITIES}: {error}"
+
+
+@single_blas_thread()  # as in the process that goes on meanwhile
+def structures_beside(
+    given: tuple[Progress, Numerics, StructurePrior],
+) -> StructurePosterior | str | None:
+    """The same in another process, which tells nobody how far it has come."""
+    return structures_of(*given)
 
 
 def probabilities(

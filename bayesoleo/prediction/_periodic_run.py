@@ -30,6 +30,7 @@ from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import (
     Boundary,
     Solution,
+    Trial,
     sensitivities,
     sensitivities_at,
     solve_extrapolated,
@@ -379,6 +380,14 @@ class RunPredictor:
         samples = self._at_samples(p, solution.x, x_p, solution.status, derivatives)
         jumped = self._left(p, solution.x, samples.status, monodromy)
         return replace(samples, jumped=jumped, monodromy=monodromy)
+
+    def sample_rest(self, p: Array) -> PredictedSamples:
+        """Equations at rest, and outputs as if rest solved them, with derivatives, at constants
+        ``p (1, np)``: what that needs is compiled then."""
+        lanes = np.zeros(1, dtype=np.int64)
+        x = np.zeros((1, self.steps, self.scheme.width))
+        Trial(self.boundary, p, x).evaluate(lanes)
+        return self._at_samples(p, x, np.ones((*x.shape, len(self.active))), lanes, True)
 
     def compare_rest(self, p: Array) -> PredictedSamples:
         """Compare rest with the samples as solutions are, at constants ``p (1, np)``, and make it

@@ -317,6 +317,11 @@ def _compiled(
     return Solution(x, status, iterations)
 
 
+def solve_in_batch(problem: Boundary, p: Array, start: Array, most: int = 40) -> Solution:
+    """The same by kernels of whole arrays, in place, as for equations that are not compiled."""
+    return _Newton(problem, p, start, most, True).run()
+
+
 class _Newton:
     """State of one batched iteration."""
 
