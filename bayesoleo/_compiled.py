@@ -10,13 +10,17 @@ loop over points into vector instructions.
 from __future__ import annotations
 
 import ctypes
+import errno
 import pickle
+import sys
+import time
+import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cached_property, lru_cache, wraps
 from math import prod
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import IO, Any, Protocol, cast
 
 import numba
 import numpy as np
@@ -27,7 +31,14 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
 
-from bayesoleo._machine_code import COMPILING, address_of, sealed, unsealed, write_durably
+from bayesoleo._machine_code import (
+    COMPILING,
+    address_of,
+    cache_folder,
+    sealed,
+    unsealed,
+    write_durably,
+)
 from bayesoleo._types import Array, Integers
 
 #: Their annotations lack too much for them to be called in checked code.
@@ -121,21 +132,62 @@ class _CheckedCache(_FunctionCache):  # type: ignore[misc]
 LEVEL = 1
 
 
-def _quickly(compile_one: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """A dispatcher's method that compiles, at :data:`LEVEL`."""
+#: Seconds that a process waits for another one that compiles the same function, and between looks.
+PATIENCE, LOOK = 120.0, 0.02
+#: Functions that this process is compiling; those within others are not waited for.
+_compiling: list[str] = []
+
+
+def _compiler_of(function: Callable[..., Any], compile_one: Callable[[Any], Any]) -> Any:
+    """A dispatcher's method that compiles, at :data:`LEVEL`, and in one process at a time."""
 
     @wraps(compile_one)
     def compiled(signature: Any) -> Any:
         # Numba reads the level while it compiles, which it does under this lock.
-        with global_compiler_lock:
+        with global_compiler_lock, ExitStack() as stack:
+            if not _compiling:
+                stack.enter_context(_in_one_process(f"{function.__module__}.{function.__name__}"))
             before = _config.OPT
             _config.OPT = type(before)(min(before, LEVEL))
+            _compiling.append(function.__name__)
             try:
                 return compile_one(signature)
             finally:
+                _compiling.pop()
                 _config.OPT = before
 
     return compiled
+
+
+@contextmanager
+def _in_one_process(name: str) -> Iterator[None]:
+    """Wait while another process compiles a function; it is on disk then."""
+    with suppress(OSError), (cache_folder() / "compiling.lock").open("ab") as file:
+        end = time.monotonic() + PATIENCE
+        while not _locked(file, zlib.crc32(name.encode()) >> 2) and time.monotonic() < end:
+            time.sleep(LOOK)
+        yield  # the lock ends with the file
+        return
+    yield  # on a disk that has no locks two may compile the same
+
+
+def _locked(file: IO[bytes], byte: int) -> bool:
+    """Whether one byte of a file, which need not be there, is locked now for this process."""
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            file.seek(byte)
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, byte)
+    except OSError as error:
+        if error.errno in (errno.EACCES, errno.EAGAIN):
+            return False
+        raise
+    return True
 
 
 def cached[F: Callable[..., Any]](**options: Any) -> Callable[[F], F]:
@@ -151,7 +203,7 @@ def cached[F: Callable[..., Any]](**options: Any) -> Callable[[F], F]:
         made: Any = numba.njit(nogil=True, **options)(function)
         if hasattr(made, "enable_caching"):  # it is plain Python where NUMBA_DISABLE_JIT is set
             made._cache = _CheckedCache(function)
-            made.compile = _quickly(made.compile)
+            made.compile = _compiler_of(function, made.compile)
         return cast(F, made)
 
     return decorate

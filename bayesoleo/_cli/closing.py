@@ -224,7 +224,7 @@ def add_loop(app: typer.Typer) -> None:
     shell.add(app, PANEL, demo, init, close, each, check)
 
 
-@options.of_settings("seed", "jobs")
+@options.of_settings("seed", "jobs", search=True)
 def demo(
     out: Annotated[
         Path,

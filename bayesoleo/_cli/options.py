@@ -84,7 +84,9 @@ Quiet = Annotated[
 ]
 
 
-def of_settings(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def of_settings(
+    *names: str, search: bool = False
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command the options of settings in place of its parameter ``chosen``.
 
     The command receives ``chosen`` as :class:`~bayesoleo._workflow.settings.Settings`.
@@ -93,13 +95,15 @@ def of_settings(*names: str) -> Callable[[Callable[..., None]], Callable[..., No
     ----------
     *names : str
         Names of the settings, in the order of ``--help``.
+    search : bool
+        Whether the command searches although it is given no campaign.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @wraps(command)
         def called(**given: Any) -> None:
-            if "quick" in names and "campaign" in given:  # it takes long
-                shell.begin(command.__name__, given, search="max_effects" in names)
+            if search or ("quick" in names and "campaign" in given):  # it takes long
+                shell.begin(command.__name__, given, search=search or "max_effects" in names)
             chosen = settings(**{name: given.pop(name) for name in names})
             command(**given, chosen=chosen)
 

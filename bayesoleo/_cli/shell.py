@@ -358,7 +358,8 @@ def begin(command: str, given: Mapping[str, Any], *, search: bool) -> None:
     given : mapping of str to object
         Its arguments and options; ``quiet`` says nothing.
     search : bool
-        Whether another process will help: it loads them at the same time.
+        Whether another process will help: it loads them at the same time, unless something has to
+        be compiled first.
     """
     campaign = given.get("campaign")
     if isinstance(campaign, Path) and not campaign.expanduser().exists():
@@ -366,10 +367,12 @@ def begin(command: str, given: Mapping[str, Any], *, search: bool) -> None:
     if not given.get("quiet"):
         of = f" {campaign}" if campaign is not None else ""
         complain(f"{command}{of}: loading libraries")
+    from bayesoleo._first_compilation import begin_early
     from bayesoleo._worker_processes import load, start_ahead
 
-    if search:
-        start_ahead(jobs=given.get("jobs"))
+    jobs = given.get("jobs")
+    if not begin_early(jobs) and search:
+        start_ahead(jobs=jobs)
     load(["bayesoleo._workflow.closing"])
 
 

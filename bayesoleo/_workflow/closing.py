@@ -129,8 +129,8 @@ def close(
         summary says in ``unfinished`` what is missing and why; it is written like any other.
     """
     output = ResultFolder.checked(out)
-    start_ahead(jobs=settings.jobs)
     task = prepare(campaign, model, settings, progress=progress)
+    start_ahead(jobs=settings.jobs)
     _check_aim(task)
     with output.alone():
         stages, begun = Stages(callback), time.monotonic()

@@ -1,8 +1,8 @@
-"""Compilation in a process of its own of what a search needs later, where nothing is compiled yet.
+"""Compilation of what a search needs, in two processes, where nothing is compiled yet.
 
-The search itself begins with Newton's iteration and the elimination of sensitivities, which is
-mostly the iteration's own, and compiles these. Meanwhile the other process compiles what is needed
-next.
+Another process compiles Newton's iteration and the elimination of sensitivities, which is mostly
+the iteration's own, then what is needed later. Meanwhile this one compiles what follows the first
+solution. Each waits where it comes to what the other is compiling.
 """
 
 from __future__ import annotations
@@ -11,44 +11,49 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bayesoleo import _first_compilation as first_compilation
 from bayesoleo._compiled import is_compiled
-from bayesoleo._parallel import available_cores, thread_limit
-from bayesoleo._worker_processes import begin_elsewhere
 from bayesoleo.discovery._structure_moments import beside
+from bayesoleo.solvers._elimination import close_and_sweep
 
 if TYPE_CHECKING:
     from bayesoleo.prediction._periodic_run import RunPredictor
 
 
 def begin_compiling(jobs: int | None) -> None:
-    """Begin in another process with what has to be compiled, where nothing is yet.
+    """Compile in another process and in this one, where nothing is compiled yet.
 
     Parameters
     ----------
     jobs : int, optional
-        How many may work at once; alone nothing is begun.
+        How many may work at once; alone nothing is compiled before it is needed.
     """
-    if _begun or min(thread_limit(), jobs or available_cores()) < 2 or is_compiled(beside):
-        return
-    _begun.append(compile_ahead.__name__)
-    begin_elsewhere(__name__, compile_ahead.__name__)
-
-
-#: What was begun: a search that follows a simulation begins nothing again.
-_begun: list[str] = []
+    if is_compiled(beside) and is_compiled(close_and_sweep):
+        first_compilation.leave_mark()
+    elif first_compilation.begin(jobs):
+        compile_here()
 
 
 def compile_ahead() -> None:
-    """Compile what follows the first solution, then the evidence of structures, then what scores
-    need for equations that are not compiled: by then the search has the elimination."""
+    """Compile in a process of its own what takes longest, in the order of need."""
+    if is_compiled(beside) and is_compiled(close_and_sweep):
+        first_compilation.leave_mark()
+        return
+    run = _oscillator()
+    run.set_anchor(_constants(run)[0])
+    _compile_evidence()
+    _compile_batches(run)
+    first_compilation.leave_mark()
+
+
+def compile_here() -> None:
+    """Compile what evaluates, samples and compares a motion."""
     from bayesoleo.solvers._switching import evaluate, periodic_signal
 
     run = _oscillator()
     run.sample_rest(_constants(run))
     run.compare_rest(_constants(run))
     evaluate(periodic_signal(1.0, np.zeros((1, 1)), np.zeros((1, 1))), np.zeros(1))
-    _compile_evidence()
-    _compile_batches(run)
 
 
 def _oscillator() -> RunPredictor:
@@ -75,8 +80,15 @@ def _constants(run: RunPredictor) -> np.ndarray:
     return np.ones((1, len(run.kernels.derived.constants)))
 
 
+def _compile_evidence() -> None:
+    # Imported once the rest is compiled: libraries take seconds to load.
+    from bayesoleo.discovery._structure_evidence import compile_evidence
+
+    compile_evidence()
+
+
 def _compile_batches(run: RunPredictor) -> None:
-    from bayesoleo.solvers._elimination import close_and_sweep
+    """The iteration for candidates whose equations are not compiled."""
     from bayesoleo.solvers._periodic import solve_in_batch
 
     assert run.anchor is not None
@@ -84,10 +96,3 @@ def _compile_batches(run: RunPredictor) -> None:
     solve_in_batch(run.boundary, _constants(run), start, most=1)
     one = np.zeros((1, 1, 1))
     close_and_sweep(np.zeros((1, 2, 1)), one[0], one, False)
-
-
-def _compile_evidence() -> None:
-    # Imported once the rest is compiled: libraries take seconds to load.
-    from bayesoleo.discovery._structure_evidence import compile_evidence
-
-    compile_evidence()

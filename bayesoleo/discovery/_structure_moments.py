@@ -358,15 +358,20 @@ def singles(
     """
     size = own.shape[1] + 1
     moments, every, whole = np.empty((len(counts), 3)), np.empty(size), np.empty((size, size))
+    variance, scaled, total = np.empty(size - 1), np.empty(size - 1), freedom + count
     for p in range(len(square)):
         top, before, around = best[min(p, 1)], own[p], spread[p]
+        for i in range(size - 1):
+            variance[i] = around[i, i]
         for s in range(slope.shape[1]):
             lost, label = gain[p, s], labels[s]
+            for i in range(size - 1):
+                scaled[i] = lost[i, 0]
             data = slope[p, s], gram[p, s], square[p], log_det[p], float(count), freedom
             first = 0
             for t in range(len(power)):
-                found[p, s, t] = _rough_single(
-                    data, power[t], counts, before, around, lost, every, whole, moments
+                found[p, s, t] = _height_of_single(
+                    data[:4], total, freedom, power[t], counts, before, variance, scaled
                 )
                 if found[p, s, t] > found[p, s, first]:
                     first = t
@@ -374,33 +379,57 @@ def singles(
             for n in range(-1, len(power)):
                 t = first if n < 0 else n
                 if n != first and found[p, s, t] > top[label] - SMALL_SHARE:
-                    _rough_single(
-                        data, power[t], counts, before, around, lost, every, whole, moments
-                    )
+                    _single(data, power[t], before, around, lost, every, whole)
+                    _squares(counts, every, whole, moments)
                     _complete(around, lost, whole)
                     found[p, s, t] += _log_sides(counts, sides[s], every, whole, moments)
                     top[label] = max(top[label], found[p, s, t])
 
 
 @inner
-def _rough_single(
-    data: tuple[float, float, float, float, float, float],
+def _height_of_single(
+    data: tuple[float, float, float, float],
+    total: float,
+    freedom: float,
     power: float,
     counts: Integers,
+    before: Array,
+    variance: Array,
+    lost: Array,
+) -> float:
+    """Log evidence but for likely sides and correlations: that of :func:`_student` with the product
+    of mean squares, without what only sides and correlations need. Most of all densities end here.
+    """
+    slope, gram, square, log_det = data
+    grown = 1.0 + power * max(gram, 0.0)
+    mean, own = power * slope / grown, power / grown
+    left = max(square - slope * mean, 0.0)
+    inverse = total / (freedom + left)
+    product, start = inverse * mean**2 + own, 0
+    for k in range(len(counts) - 1):
+        sum_of_squares = 0.0
+        for i in range(start, start + counts[k]):
+            moved = before[i] - lost[i] * mean
+            sum_of_squares += inverse * moved**2 + variance[i] + own * lost[i] ** 2
+        product *= sum_of_squares / counts[k] if counts[k] > 1 else sum_of_squares
+        start += counts[k]
+    density = -0.5 * log_det - 0.5 * total * math.log1p(left / freedom)
+    return density + math.log(product / (power * math.sqrt(grown)))
+
+
+@inner
+def _single(
+    data: tuple[float, float, float, float, float, float],
+    power: float,
     before: Array,
     around: Array,
     lost: Array,
     every: Array,
     whole: Array,
-    moments: Array,
-) -> float:
-    """Log evidence but for likely sides and correlations; leaves the amplitudes' means, what
-    :func:`_joined` has of their covariance, and mean squares in the last arrays.
-
-    The loops of :func:`_joined` are written out for one further amplitude: most of all densities
-    are of this kind.
-    """
-    slope, gram, square, log_det, count, freedom = data
+) -> None:
+    """Means of the amplitudes, and what :func:`_joined` has of their covariance, into the last
+    arrays; its loops are written out for one further amplitude."""
+    slope, gram, square, _, count, freedom = data
     grown = 1.0 + power * max(gram, 0.0)
     left = square - power * slope**2 / grown
     mean, variance = power * slope / grown, power / grown
@@ -412,9 +441,6 @@ def _rough_single(
         every[i] = (before[i] - lost[i, 0] * mean) / root
         whole[i, last] = whole[last, i] = shared
         whole[i, i] = around[i, i] - lost[i, 0] * shared
-    product = _squares(counts, every, whole, moments)
-    value = _student(left, log_det, count, freedom)
-    return value + math.log(product / (power * math.sqrt(grown)))
 
 
 @jit

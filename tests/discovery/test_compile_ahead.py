@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 
+from bayesoleo import _first_compilation as first
 from bayesoleo.discovery import (
     _compile_ahead as ahead,
     _structure_evidence as evidence,
@@ -45,39 +46,66 @@ def test_a_comparison_needs_nothing_that_was_not_compiled_ahead():
     assert signatures() == before
 
 
+LONG = ("_periodic_newton", "solve_lanes"), ("_swept_columns", "solve_columns"), *EVIDENCE
+SHORT = ("_collocation", "rows"), ("_sum_of_squares", "_compare"), ("_switching", "rows_at")
+
+
+def folders(place) -> dict[str, str]:
+    return {**os.environ, "NUMBA_CACHE_DIR": str(place / "numba"), "BAYESOLEO_CACHE": str(place)}
+
+
+def run(code, place) -> str:
+    command = [sys.executable, "-c", code]
+    return subprocess.run(
+        command, check=True, env=folders(place), capture_output=True, text=True
+    ).stdout
+
+
+def compiled(place) -> set[str]:
+    return {file.name for file in place.rglob("*.nbi")}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("function", "compiled"),
-    [
-        (
-            "compile_ahead",
-            [("_swept_columns", "solve_columns"), ("_sum_of_squares", "_compare"), *EVIDENCE],
-        ),
-        ("compile_after_simulation", [("_periodic_newton", "solve_lanes"), *EVIDENCE]),
-    ],
-)
-def test_another_process_finds_compiled_what_it_needs_next(tmp_path, function, compiled):
-    code = f"import bayesoleo.discovery._compile_ahead as m; m.{function}()"
-    folders = {"NUMBA_CACHE_DIR": str(tmp_path / "numba"), "BAYESOLEO_CACHE": str(tmp_path)}
-    subprocess.run([sys.executable, "-c", code], check=True, env={**os.environ, **folders})
-    found = {file.name for file in tmp_path.rglob("*.nbi")}
-    for module, name in compiled:
-        assert any(file.startswith(f"{module}.{name}-") for file in found), name
+def test_two_processes_compile_everything_once(tmp_path):
+    """Each waits where the other compiles: together they take all that either of them needs, and
+    what one has compiled the other one reads."""
+    code = "import bayesoleo.discovery._compile_ahead as ahead; ahead.{}()"
+    other = subprocess.Popen(
+        [sys.executable, "-c", code.format("compile_ahead")], env=folders(tmp_path)
+    )
+    run(code.format("compile_here"), tmp_path)
+    assert other.wait() == 0
+    for module, name in (*LONG, *SHORT):
+        own = [file for file in compiled(tmp_path) if file.startswith(f"{module}.{name}-")]
+        assert len(own) == 1, name
+    assert list(tmp_path.glob("compiled-*"))
+    before = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.nb[ic]")}
+    run(code.format("begin_compiling(2) or ahead.compile_here"), tmp_path)
+    assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.nb[ic]")} == before
 
 
 @pytest.mark.parametrize(
     ("jobs", "compiled", "begun"),
     [(2, False, True), (2, True, False), (1, False, False)],
 )
-@pytest.mark.parametrize("simulated", [True, False])
-def test_it_is_begun_where_it_helps(monkeypatch, jobs, compiled, begun, simulated):
-    asked = []
-    monkeypatch.setattr(ahead, "begin_elsewhere", lambda *call: asked.append(call))
+def test_it_is_begun_where_it_helps(monkeypatch, tmp_path, jobs, compiled, begun):
+    asked, here = [], []
+    monkeypatch.setenv("BAYESOLEO_CACHE", str(tmp_path))
+    monkeypatch.setattr(first, "begin_elsewhere", lambda *call: asked.append(call))
+    monkeypatch.setattr(first, "thread_limit", lambda: 2)
+    monkeypatch.setattr(first, "_begun", [])
     monkeypatch.setattr(ahead, "is_compiled", lambda _: compiled)
-    monkeypatch.setattr(ahead, "thread_limit", lambda: 2)
-    monkeypatch.setattr(ahead, "_begun", [])
-    ahead.begin_compiling(jobs, simulated=simulated)
+    monkeypatch.setattr(ahead, "compile_here", lambda: here.append(1))
+    assert first.begin_early(jobs) == (jobs > 1)  # nothing is known yet
+    assert len(asked) == (jobs > 1)
+    ahead.begin_compiling(jobs)
     ahead.begin_compiling(jobs)  # the search after a simulation
-    assert len(asked) == begun
+    assert len(asked) == (jobs > 1)
+    assert bool(here) == begun
     for module, name in asked:
         assert callable(getattr(sys.modules[module], name))
+    assert bool(list(tmp_path.glob("compiled-*"))) == compiled
+    monkeypatch.setattr(first, "_begun", [])
+    asked.clear()
+    assert first.begin_early(jobs) == (jobs > 1 and not compiled)
+    assert len(asked) == (jobs > 1 and not compiled)

@@ -1,0 +1,65 @@
+"""Compilation in a process of its own, begun with a command on a machine where nothing is compiled
+yet.
+
+Whether that is so is known for certain only once the numerical libraries are loaded, which takes
+seconds; a mark in the cache tells at once. Where the mark is missing, and everything is compiled,
+the process ends soon.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import platformdirs
+
+from bayesoleo._parallel import available_cores, thread_limit
+from bayesoleo._worker_processes import begin_elsewhere
+
+#: What the process does: a module, and a function without arguments.
+ELSEWHERE = ("bayesoleo.discovery._compile_ahead", "compile_ahead")
+#: What was begun by this process: once is enough.
+_begun: list[str] = []
+
+
+def begin_early(jobs: int | None) -> bool:
+    """Begin with what has to be compiled, unless the mark says that nothing has.
+
+    Returns whether another process compiles.
+
+    Parameters
+    ----------
+    jobs : int, optional
+        How many may work at once; alone nothing is begun.
+    """
+    return not _mark().exists() and begin(jobs)
+
+
+def begin(jobs: int | None) -> bool:
+    """Begin, if that was not done; whether another process compiles."""
+    if min(thread_limit(), jobs or available_cores()) < 2:
+        return False
+    if not _begun:
+        _begun.append(ELSEWHERE[1])
+        begin_elsewhere(*ELSEWHERE)
+    return True
+
+
+def leave_mark() -> None:
+    """Say that everything is compiled."""
+    with suppress(OSError):  # the next command looks once more
+        mark = _mark()
+        mark.parent.mkdir(parents=True, exist_ok=True)
+        mark.touch()
+
+
+def _mark() -> Path:
+    """Of this installation, this Python and the folder in which Numba keeps what it compiled."""
+    chosen = os.environ.get("BAYESOLEO_CACHE")
+    folder = Path(chosen) if chosen else Path(platformdirs.user_cache_dir("bayesoleo"))
+    own = Path(__file__)
+    of = [str(own), str(own.stat().st_mtime_ns), sys.version, os.environ.get("NUMBA_CACHE_DIR", "")]
+    return folder / f"compiled-{hashlib.sha256(repr(of).encode()).hexdigest()[:16]}"
