@@ -31,10 +31,10 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
 
+from bayesoleo._cache_folder import user_cache
 from bayesoleo._machine_code import (
     COMPILING,
     address_of,
-    cache_folder,
     sealed,
     unsealed,
     write_durably,
@@ -162,13 +162,32 @@ def _compiler_of(function: Callable[..., Any], compile_one: Callable[[Any], Any]
 @contextmanager
 def _in_one_process(name: str) -> Iterator[None]:
     """Wait while another process compiles a function; it is on disk then."""
-    with suppress(OSError), (cache_folder() / "compiling.lock").open("ab") as file:
+    file = _lock_of(name)
+    try:
+        yield
+    finally:
+        if file is not None:  # the lock ends with it
+            file.close()
+
+
+def _lock_of(name: str) -> IO[bytes] | None:
+    """A file that is locked for a function, unless another process holds it for too long.
+
+    None on a disk that has no locks: two processes may then compile the same.
+    """
+    with suppress(OSError):
+        folder = user_cache()
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / "compiling.lock").open("ab")
         end = time.monotonic() + PATIENCE
-        while not _locked(file, zlib.crc32(name.encode()) >> 2) and time.monotonic() < end:
-            time.sleep(LOOK)
-        yield  # the lock ends with the file
-        return
-    yield  # on a disk that has no locks two may compile the same
+        try:
+            while not _locked(file, zlib.crc32(name.encode()) >> 2) and time.monotonic() < end:
+                time.sleep(LOOK)
+        except BaseException:
+            file.close()
+            raise
+        return file
+    return None
 
 
 def _locked(file: IO[bytes], byte: int) -> bool:

@@ -14,8 +14,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-import platformdirs
-
+from bayesoleo._cache_folder import user_cache
 from bayesoleo._parallel import available_cores, thread_limit
 from bayesoleo._worker_processes import begin_elsewhere
 
@@ -58,8 +57,6 @@ def leave_mark() -> None:
 
 def _mark() -> Path:
     """Of this installation, this Python and the folder in which Numba keeps what it compiled."""
-    chosen = os.environ.get("BAYESOLEO_CACHE")
-    folder = Path(chosen) if chosen else Path(platformdirs.user_cache_dir("bayesoleo"))
     own = Path(__file__)
     of = [str(own), str(own.stat().st_mtime_ns), sys.version, os.environ.get("NUMBA_CACHE_DIR", "")]
-    return folder / f"compiled-{hashlib.sha256(repr(of).encode()).hexdigest()[:16]}"
+    return user_cache() / f"compiled-{hashlib.sha256(repr(of).encode()).hexdigest()[:16]}"

@@ -23,9 +23,10 @@ from pathlib import Path
 from typing import Any
 
 import llvmlite
-import platformdirs
 from llvmlite import binding as llvm
 from numba import config
+
+from bayesoleo._cache_folder import user_cache
 
 #: What a source calls the one function that it defines.
 ENTRY = "@kernel("
@@ -225,9 +226,7 @@ def _compiled(source: str) -> bytes:
 
 def cache_folder() -> Path:
     """Where generated kernels are kept: ``BAYESOLEO_CACHE`` or the user's cache folder."""
-    chosen = os.environ.get("BAYESOLEO_CACHE")
-    folder = Path(chosen) if chosen else Path(platformdirs.user_cache_dir("bayesoleo"))
-    folder = folder / "kernels"
+    folder = user_cache() / "kernels"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:  # a read-only home must not stop a computation; only the cache is lost

@@ -281,3 +281,46 @@ def test_the_largest_of_several_comes_back_as_it_was():
     assert hash(found) == hash(sent)
     assert sp.diff(found, x) == sp.diff(sent, x)
     assert found.subs({x: 2, y: 5, z: 1}) == sent.subs({x: 2, y: 5, z: 1}) == 18
+
+
+def where_and_twice(value):
+    if value == "wrong":
+        raise ValueError(value)
+    return os.getpid(), 2 * value
+
+
+def test_a_long_call_is_done_beside(eager):
+    pid, value = processes.Beside(where_and_twice, 21, 2).result()
+    assert value == 42
+    assert pid != os.getpid()
+    assert processes.Beside(where_and_twice, 1, 2).result() == (pid, 2)  # it is free again
+
+
+def test_what_it_raises_is_raised_where_the_result_is_asked_for(eager):
+    beside = processes.Beside(where_and_twice, "wrong", 2)
+    with pytest.raises(ValueError, match="wrong"):
+        beside.result()
+    assert processes.Beside(where_and_twice, 3, 2).result()[1] == 6
+
+
+@pytest.mark.parametrize("reason", ["one job", "busy", "lost", "cannot be sent"])
+def test_a_call_that_cannot_be_done_beside_is_done_here(eager, monkeypatch, reason):
+    jobs = 1 if reason == "one job" else 2
+    if reason == "busy":
+        other = processes.Beside(time.sleep, 0.5, 2)
+    if reason == "lost":
+        processes._worker(0).process.kill()
+        monkeypatch.setattr(processes, "_worker", lambda number: processes._workers[number])
+    function = (lambda value: threading.Lock() and (os.getpid(), 2 * value)) if (
+        reason == "cannot be sent"
+    ) else where_and_twice  # fmt: skip
+    argument = Unsendable(4) if reason == "cannot be sent" else 4
+    beside = processes.Beside(function, argument, jobs)
+    assert beside.result() == beside.result() == (os.getpid(), 8)
+    if reason == "busy":
+        assert other.result() is None
+
+
+class Unsendable(int):
+    def __reduce__(self):
+        raise TypeError("it stays here")

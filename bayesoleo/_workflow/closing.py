@@ -10,6 +10,7 @@ import math
 import os
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -24,14 +25,17 @@ from bayesoleo._workflow.output import (
     REPORT_STAGE,
     SEARCH_STAGE,
     Drawn,
+    Groups,
     ResultFolder,
     Stages,
     reason_of,
     report_what_is_there,
+    result_groups,
     result_tree,
     write_result,
 )
 from bayesoleo._workflow.settings import Settings
+from bayesoleo._workflow.structures_beside import Answer, Asked, answer_later
 from bayesoleo._workflow.task import Source, Task, prepare, silent
 from bayesoleo.discovery._inference import CATALOGUE
 from bayesoleo.discovery._loop import (
@@ -39,13 +43,10 @@ from bayesoleo.discovery._loop import (
     close_loop,
     judged,
     loop_of,
-    structures_beside,
 )
 from bayesoleo.discovery._next_experiment import check_aim
-from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._open_questions import Question, questions_of
 from bayesoleo.discovery._round import Progress
-from bayesoleo.discovery._structures import StructurePosterior, StructurePrior
 from bayesoleo.discovery._work import QUICK
 from bayesoleo.effects._catalogue import catalogue, catalogue_titles, with_titles
 from bayesoleo.error_models._registry import AUTO
@@ -137,45 +138,42 @@ def close(
         loop = run_loop(
             task, settings.max_effects, stages, output, resume=True, leave_structures=settings.quick
         )
-        structures, place = structures_later(task, loop), output.checkpoints
+        ask = Asked(
+            loop, settings.numerics, settings.structure_prior, task.campaign.rig, settings.next_run
+        )
+        later, place = answer_later(ask, settings.jobs), output.checkpoints
         keep = not settings.quick or time.monotonic() - begun > WORTH_KEEPING
         if keep:
-            loop, questions = with_structures(task, loop, structures, stages)
+            loop, questions = with_structures(task, loop, later, stages)
             _write_found(task, loop, output, stages, questions)
         callback("sample the posterior")
         drawn = stages.attempt(
             POSTERIOR_STAGE, lambda: draw_final(task, loop, place, callback, progress), lambda: None
         )
+        groups = None
+        with suppress(Exception):  # it is made again where what fails is told
+            groups = result_groups(task, loop, drawn, stages)
         if not keep:
-            loop, questions = with_structures(task, loop, structures, stages)
-        return written(task, loop, drawn, output, stages, questions)
-
-
-Structures = Beside[tuple[Progress, Numerics, StructurePrior], StructurePosterior | str | None]
-
-
-def structures_later(task: Task, loop: ClosedLoop) -> Structures | None:
-    """The probabilities of structures, computed in another process; None where the loop has them,
-    or there are none. The draws do not depend on them."""
-    progress, settings = loop.without_structures, task.settings
-    if progress is None:
-        return None
-    given = progress, settings.numerics, settings.structure_prior
-    return Beside(structures_beside, given, settings.jobs)
+            loop, questions = with_structures(task, loop, later, stages)
+        return written(task, loop, drawn, output, stages, questions, groups)
 
 
 def with_structures(
-    task: Task, loop: ClosedLoop, structures: Structures | None, stages: Stages
+    task: Task, loop: ClosedLoop, later: Beside[Asked, Answer] | None, stages: Stages
 ) -> tuple[ClosedLoop, tuple[Question, ...]]:
     """The loop with the probabilities, and the runs that would tell apart what is left."""
-    if structures is not None:
-        stages.callback("compare structures")
-        try:
-            loop = judged(loop, structures.result())
-        except Exception as error:
-            assert loop.without_structures is not None
-            loop = _broken_off(loop.without_structures, task, stages, error)
-    return loop, asked(task, loop, stages)
+    if later is None:
+        return loop, asked(task, loop, stages)
+    stages.callback("compare structures")
+    try:
+        found = later.result()
+    except Exception as error:
+        assert loop.without_structures is not None
+        return _broken_off(loop.without_structures, task, stages, error), ()
+    loop = judged(loop, found.structures)
+    if not loop.complete:
+        return loop, ()
+    return loop, stages.attempt(PROPOSALS_STAGE, found.asked, no_questions)
 
 
 def draw_final(
@@ -238,10 +236,11 @@ def written(
     output: ResultFolder,
     stages: Stages,
     questions: Sequence[Question],
+    groups: Groups | None = None,
 ) -> xr.DataTree:
     """The result, written; if nothing failed on the way to it."""
     try:
-        tree = write_result(task, loop, drawn, output, stages, questions)
+        tree = write_result(task, loop, drawn, output, stages, questions, groups)
     except ResultsError:  # nothing more can be written than was
         raise
     except Exception as error:

@@ -302,6 +302,7 @@ def reason_of(error: Exception) -> str:
 
 
 Drawn = tuple[Samples, LogDensity]
+Groups = dict[str, xr.Dataset]
 
 
 def write_result(
@@ -311,6 +312,7 @@ def write_result(
     output: ResultFolder,
     stages: Stages,
     questions: Sequence[Question] = (),
+    groups: Groups | None = None,
 ) -> xr.DataTree:
     """The tree of a closed loop, with its summary and its report; with a folder, its three files.
 
@@ -326,8 +328,10 @@ def write_result(
         What failed before; what fails here is added.
     questions : sequence of Question, optional
         What it left to be told apart, and by which runs that could be done.
+    groups : mapping of str to Dataset, optional
+        What :func:`result_groups` has made of it, if that was done before.
     """
-    tree, summary = result_tree(task, loop, drawn, output, stages, questions)
+    tree, summary = result_tree(task, loop, drawn, output, stages, questions, groups)
     if output.folder is None:
         return tree
     stages.callback("write results and report")
@@ -391,6 +395,23 @@ def report_what_is_there(output: ResultFolder, stages: Stages) -> xr.DataTree | 
     return tree
 
 
+def result_groups(task: Task, loop: ClosedLoop, drawn: Drawn | None, stages: Stages) -> Groups:
+    """The groups of :func:`write_result` that depend neither on the probabilities of structures nor
+    on what new runs would tell."""
+    seed, fit = task.settings.seed, loop.final.fit
+    groups = {schema.POINT: point_group(fit)}
+    groups |= stages.attempt(
+        PREDICTIONS_STAGE,
+        lambda: loop_groups(loop, drawn, seed),
+        lambda: _without_failing(loop, seed),
+    )
+    if drawn is not None:
+        groups |= stages.attempt(
+            POSTERIOR_STAGE, lambda: _posterior(fit, drawn, seed, groups), dict
+        )
+    return groups
+
+
 def result_tree(
     task: Task,
     loop: ClosedLoop,
@@ -398,21 +419,12 @@ def result_tree(
     output: ResultFolder,
     stages: Stages,
     questions: Sequence[Question] = (),
+    groups: Groups | None = None,
 ) -> tuple[xr.DataTree, dict[str, Any]]:
     """The tree of :func:`write_result` and its summary; nothing is written."""
-    seed, fit = task.settings.seed, loop.final.fit
-    unit = _drive_unit(task, loop)
-    groups = {schema.POINT: point_group(fit)}
-    groups |= stages.attempt(
-        PREDICTIONS_STAGE,
-        lambda: loop_groups(loop, drawn, seed),
-        lambda: _without_failing(loop, seed),
-    )
-    groups |= proposals_group(questions, unit)
-    if drawn is not None:
-        groups |= stages.attempt(
-            POSTERIOR_STAGE, lambda: _posterior(fit, drawn, seed, groups), dict
-        )
+    fit, unit = loop.final.fit, _drive_unit(task, loop)
+    groups = result_groups(task, loop, drawn, stages) if groups is None else groups
+    groups = groups | proposals_group(questions, unit)
     samples = drawn[0] if drawn is not None and schema.POSTERIOR in groups else None
     # Bare names: they stay true when the folder moves.
     names = {"report": REPORT, "result": RESULTS, "summary": SUMMARY}

@@ -416,14 +416,6 @@ def structures_of(
         return f"{NO_PROBABILITIES}: {error}"
 
 
-@single_blas_thread()  # as in the process that goes on meanwhile
-def structures_beside(
-    given: tuple[Progress, Numerics, StructurePrior],
-) -> StructurePosterior | str | None:
-    """The same in another process, which tells nobody how far it has come."""
-    return structures_of(*given)
-
-
 def probabilities(
     progress: Progress, numerics: Numerics, prior: StructurePrior, callback: ProgressCallback
 ) -> StructurePosterior | None:

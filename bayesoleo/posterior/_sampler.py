@@ -283,7 +283,7 @@ def _quick_evaluations(log_density: Density) -> int:
 
 def _schedule(effective_size: float, evaluations: int, segment: int, quick: bool) -> Schedule:
     if quick:
-        return Schedule(min(effective_size, 200.0), evaluations, 20, 3, 1, 16, 7.0, segment)
+        return Schedule(min(effective_size, 200.0), evaluations, 20, 3, 1, 16, 5.0, segment)
     return Schedule(effective_size, evaluations, 20, 6, 2, 50, 20.0, segment)
 
 

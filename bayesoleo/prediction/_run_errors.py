@@ -31,7 +31,7 @@ from bayesoleo.prediction._inputs import (
 )
 from bayesoleo.prediction._periodic_run import RunPredictor
 from bayesoleo.prediction._periodic_solver import SolvedRun
-from bayesoleo.prediction._records import TABLE, Harmonics
+from bayesoleo.prediction._records import TABLE, Harmonics, Record
 from bayesoleo.prediction._transient_run import TransientRun
 from bayesoleo.solvers._collocation import Collocation
 from bayesoleo.solvers._error_estimate import NONE, ErrorEstimate, estimate_error
@@ -197,8 +197,7 @@ class _InputChanges:
             derivatives = tuple(orders.values())
             block: _Block
             if record.periodic:
-                item = harmonics_of(record, channel).for_derivative(highest[channel])
-                block = _Known(_harmonic_changes(item, record.frequency, derivatives, phase))
+                block = _Known(_harmonics.of(record, channel, highest[channel], derivatives, phase))
             else:
                 curve = cast(Smoothed, signal_of(record, channel, highest[channel]))
                 size, rate = record.time.size, record.rate
@@ -363,6 +362,46 @@ class _Draws:
 
 
 _errors = _Draws(MOST_KEPT)
+
+
+class _HarmonicChanges:
+    """Changes by the harmonics of runs, those asked for last: each model of a run asks for them
+    again, and of a broadband input they take as long as the states."""
+
+    def __init__(self, most: float):
+        self.most, self.lock = most, threading.Lock()
+        self.kept: OrderedDict[tuple[object, ...], tuple[Record, Array]] = OrderedDict()
+
+    def of(
+        self,
+        record: Record,
+        channel: str,
+        highest: int,
+        derivatives: tuple[int, ...],
+        phase: Array,
+    ) -> Array:
+        """See :func:`_harmonic_changes`; not to be written to."""
+        # The record is kept too, so that no other one gets its number.
+        key = id(record), channel, highest, derivatives, phase.tobytes(), MOST_LINES
+        with self.lock:
+            if key in self.kept:
+                self.kept.move_to_end(key)
+                return self.kept[key][1]
+        item = harmonics_of(record, channel).for_derivative(highest)
+        found = _harmonic_changes(item, record.frequency, derivatives, phase)
+        found.flags.writeable = False
+        with self.lock:
+            self.kept[key] = record, found
+            while len(self.kept) > 1 and self._size() > self.most:
+                self.kept.popitem(last=False)
+        return found
+
+    def _size(self) -> int:
+        """Bytes of what is kept."""
+        return sum(found.nbytes for _, found in self.kept.values())
+
+
+_harmonics = _HarmonicChanges(MOST_KEPT)
 
 
 @lru_cache(maxsize=4)

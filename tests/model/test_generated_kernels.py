@@ -371,7 +371,7 @@ def compiled(tmp_path, monkeypatch):
 def test_a_damaged_file_of_the_cache_is_made_anew(compiled, monkeypatch, damage):
     assert evaluate(SMALL, monkeypatch) == [1.5, 2.5, 3.5]
     assert called(compiled) == 3.0
-    files = [path for path in compiled.rglob("*") if path.is_file() and path.suffix != ".py"]
+    files = [path for path in compiled.rglob("*") if path.suffix in (".o", ".nbi", ".nbc")]
     assert {path.suffix for path in files} == {".o", ".nbi", ".nbc"}, "all of these are damaged"
     for path in files:
         path.write_bytes(damage(path.read_bytes()))
@@ -390,7 +390,8 @@ def test_a_full_disk_costs_only_the_cache(compiled, monkeypatch):
     monkeypatch.setattr("bayesoleo._machine_code.os.fsync", full)
     assert evaluate(SMALL, monkeypatch) == [1.5, 2.5, 3.5]
     assert called(compiled) == 3.0
-    assert [path.name for path in compiled.rglob("*") if path.is_file()] == ["compiled.py"]
+    left = {path.name for path in compiled.rglob("*") if path.is_file()}
+    assert left <= {"compiled.py", "compiling.lock"}  # a lock is empty
 
 
 def test_a_cache_that_was_moved_is_used_where_it_is(tmp_path, monkeypatch):

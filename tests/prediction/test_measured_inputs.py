@@ -165,3 +165,31 @@ def test_few_harmonics_keep_a_column_each():
         found[0, 1 if 0 in item.orders else 0], sd * np.cos(2 * np.pi * first * known.phase),
         atol=1e-12,
     )  # fmt: skip
+
+
+def test_changes_by_harmonics_are_kept_for_the_next_model_and_not_for_another_run(
+    record, monkeypatch
+):
+    kept = _run_errors._HarmonicChanges(1e6)
+    phase, turned = np.linspace(0, 1, 9), np.linspace(0, 2, 9)
+    asked = [("force", 1, (0, 1), phase), ("force", 1, (0, 1), turned), ("force", 1, (1,), phase)]
+    asked += [("displacement", 1, (0, 1), phase)]
+    found = {}
+    for other in (record, replace(record, frequency=2.0)):
+        for channel, highest, derivatives, at in asked:
+            item = harmonics_of(other, channel).for_derivative(highest)
+            rightly = _run_errors._harmonic_changes(item, other.frequency, derivatives, at)
+            now = kept.of(other, channel, highest, derivatives, at)
+            np.testing.assert_array_equal(now, rightly)
+            found[len(found)] = now
+    monkeypatch.setattr(_run_errors, "_harmonic_changes", None)  # nothing is made again
+    assert kept.of(record, *asked[0]) is found[0]
+    with pytest.raises(ValueError, match="read-only"):
+        found[0][0] = 0.0
+
+
+def test_no_more_changes_are_kept_than_fit(record):
+    kept = _run_errors._HarmonicChanges(1.0)
+    for size in (5, 6, 7):
+        kept.of(record, "force", 0, (0,), np.linspace(0, 1, size))
+    assert len(kept.kept) == 1  # the last one is kept whatever its size

@@ -20,7 +20,7 @@ from bayesoleo import _schema as schema, _workflow as workflow
 from bayesoleo._cli import app
 from bayesoleo._cli.shell import UNFINISHED
 from bayesoleo._storage.result_files import read_tree
-from bayesoleo._workflow import closing, output
+from bayesoleo._workflow import closing, output, structures_beside
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.discovery import _loop as search
 from bayesoleo.effects import find_effect
@@ -165,6 +165,22 @@ def test_a_posterior_that_fails_leaves_the_effect(campaign, tmp_path, monkeypatc
     assert summary["effects"] == ["coulomb_friction"]
     assert summary["parameters"]["damping"]["interval"] is None
     assert len(summary["unfinished"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "stage"), [("structures_of", "search"), ("questions_of", "proposals")]
+)
+def test_what_is_compared_beside_the_draws_may_fail(campaign, tmp_path, monkeypatch, name, stage):
+    monkeypatch.setattr(structures_beside, name, broken)
+    with pytest.raises(UnfinishedError) as caught:
+        workflow.close(campaign, damper(), SETTINGS, out=tmp_path)
+    summary = check_unfinished(tmp_path, caught.value, stage)
+    assert summary["effects"] == ["coulomb_friction"]
+    assert summary["parameters"]["damping"]["interval"] is not None
+    # Without probabilities nothing is certain.
+    assert (summary["certainty"] == schema.CERTAIN) == summary["certain"]
+    assert not (summary["certain"] and stage == "search")
+    assert ("probability" in json.dumps(summary["structures"])) == (stage == "proposals")
 
 
 def test_without_a_folder_the_error_carries_what_is_known(campaign, monkeypatch):

@@ -1,0 +1,98 @@
+"""Two processes do not compile the same function: one waits, and reads what the other has made."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from bayesoleo import _compiled as compiled
+
+HOLD = """
+import sys, time
+from bayesoleo._compiled import _in_one_process
+with _in_one_process(sys.argv[1]):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("BAYESOLEO_CACHE", str(tmp_path))
+    return tmp_path
+
+
+@pytest.fixture
+def holder(cache):
+    """Another process that is compiling a function called f."""
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", HOLD, "f"], text=True, **pipes) as process:
+        assert process.stdout.readline().strip() == "held"
+        yield process
+        process.kill()
+
+
+def entered(name: str) -> float:
+    """Seconds until a function may be compiled here."""
+    begin = time.monotonic()
+    with compiled._in_one_process(name):
+        return time.monotonic() - begin
+
+
+@pytest.mark.parametrize("end", ["done", "killed"])
+def test_one_waits_until_the_other_is_done_or_gone(holder, end):
+    wait = 0.5
+
+    def release():
+        holder.kill() if end == "killed" else holder.stdin.close()
+
+    timer = threading.Timer(wait, release)
+    timer.start()
+    assert entered("f") > 0.9 * wait  # a timer is not early by a tenth
+    timer.join()
+
+
+def test_another_function_is_not_waited_for(holder):
+    assert entered("g") < 0.5 * compiled.PATIENCE
+    assert holder.poll() is None
+
+
+def test_nobody_waits_for_ever(holder, monkeypatch):
+    monkeypatch.setattr(compiled, "PATIENCE", 0.2)
+    assert entered("f") >= 0.2
+    assert holder.poll() is None
+
+
+def test_a_disk_without_locks_stops_nothing(cache, monkeypatch):
+    def refuses(*_):
+        raise OSError(37, "no locks available")
+
+    monkeypatch.setattr(compiled, "_locked", refuses)
+    assert entered("f") < compiled.PATIENCE
+
+
+def test_an_error_within_is_passed_on(cache):
+    with pytest.raises(ZeroDivisionError), compiled._in_one_process("f"):
+        raise ZeroDivisionError
+    with pytest.raises(FileNotFoundError), compiled._in_one_process("f"):
+        raise FileNotFoundError(os.fspath(cache))  # not taken for a disk without locks
+
+
+@pytest.mark.skipif(not hasattr(compiled._fill, "signatures"), reason="nothing is compiled")
+def test_the_level_of_optimisation_is_given_back():
+    config = compiled._config
+    before = config.OPT
+    seen = []
+    compile_one = compiled._compiler_of(entered, lambda _: seen.append(int(config.OPT)))
+    compile_one(None)
+    assert seen == [min(int(before), compiled.LEVEL)]
+    assert before == config.OPT
+    with pytest.raises(ZeroDivisionError):
+        compiled._compiler_of(entered, lambda _: 1 // 0)(None)
+    assert before == config.OPT
+    assert not compiled._compiling
