@@ -11,6 +11,7 @@ leaves of them, where its spectrum is not flat; see ``_transient_variance.py``.
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -69,7 +70,17 @@ class NoiseOfEstimates:
 
     @classmethod
     def of(cls, fit: ModelFit) -> NoiseOfEstimates:
-        """Of the fitted runs."""
+        """Of the fitted runs. That of the last fit is kept: the choice of an error model and what
+        is told to it ask for the same."""
+        for last, found in _last:
+            if last() is fit:
+                return found
+        found = cls._of(fit)
+        _last[:] = [(weakref.ref(fit), found)]
+        return found
+
+    @classmethod
+    def _of(cls, fit: ModelFit) -> NoiseOfEstimates:
         response, fitted = fit.point.covariance, predict_fitted(fit)
         roles = {one.record.label: "fit" for one in fitted}
         found = [compared(one, roles, policy=fit.policy) for one in fitted]
@@ -102,6 +113,9 @@ class NoiseOfEstimates:
         """Variance of the worst known unknown over the stated one, at least one."""
         variance, white = np.diag(self.covariance), np.diag(self.stated)
         return float(np.max(variance[white > 0.0] / white[white > 0.0], initial=1.0))
+
+
+_last: list[tuple[weakref.ref[ModelFit], NoiseOfEstimates]] = []
 
 
 def _scatters(runs: Sequence[LinearisedRun], response: Array, drawn: bool) -> tuple[Array, Array]:
