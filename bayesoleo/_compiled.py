@@ -93,6 +93,11 @@ def compilation_told(callback: Callable[[str], object]) -> Iterator[None]:
             _listeners.remove(callback)
 
 
+def _tell() -> None:
+    if _listeners:
+        _listeners.pop()(COMPILED_ONCE)
+
+
 def is_compiled(function: Any) -> bool:
     """Whether a function of :func:`cached` is on disk, for some arguments."""
     cache = getattr(function, "_cache", None)
@@ -115,11 +120,16 @@ class _CheckedCache(_FunctionCache):  # type: ignore[misc]
         """Whether nothing was compiled of the function on this machine."""
         return not Path(self._cache_file._index_path).is_file()
 
+    def holds(self, signature: Any, target: Any) -> bool:
+        """Whether something was compiled before for these arguments."""
+        key = self._index_key(signature, target.codegen())
+        return key in self._cache_file._load_index()
+
     def load_overload(self, signature: Any, target: Any) -> Any:
         """What was compiled before; that something has to be compiled now is told once."""
         found = super().load_overload(signature, target)
-        if found is None and _listeners:
-            _listeners.pop()(COMPILED_ONCE)
+        if found is None:
+            _tell()
         return found
 
     def _save_overload(self, signature: Any, data: Any) -> None:
@@ -138,14 +148,15 @@ PATIENCE, LOOK = 120.0, 0.02
 _compiling: list[str] = []
 
 
-def _compiler_of(function: Callable[..., Any], compile_one: Callable[[Any], Any]) -> Any:
+def _compiler_of(dispatcher: Any) -> Callable[[Any], Any]:
     """A dispatcher's method that compiles, at :data:`LEVEL`, and in one process at a time."""
+    function, compile_one = dispatcher.py_func, dispatcher.compile
 
     @wraps(compile_one)
     def compiled(signature: Any) -> Any:
         # Numba reads the level while it compiles, which it does under this lock.
         with global_compiler_lock, ExitStack() as stack:
-            if not _compiling:
+            if not _compiling and not dispatcher._cache.holds(signature, dispatcher.targetctx):
                 stack.enter_context(_in_one_process(f"{function.__module__}.{function.__name__}"))
             before = _config.OPT
             _config.OPT = type(before)(min(before, LEVEL))
@@ -182,6 +193,7 @@ def _lock_of(name: str) -> IO[bytes] | None:
         end = time.monotonic() + PATIENCE
         try:
             while not _locked(file, zlib.crc32(name.encode()) >> 2) and time.monotonic() < end:
+                _tell()
                 time.sleep(LOOK)
         except BaseException:
             file.close()
@@ -222,7 +234,7 @@ def cached[F: Callable[..., Any]](**options: Any) -> Callable[[F], F]:
         made: Any = numba.njit(nogil=True, **options)(function)
         if hasattr(made, "enable_caching"):  # it is plain Python where NUMBA_DISABLE_JIT is set
             made._cache = _CheckedCache(function)
-            made.compile = _compiler_of(function, made.compile)
+            made.compile = _compiler_of(made)
         return cast(F, made)
 
     return decorate

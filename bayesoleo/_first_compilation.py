@@ -2,8 +2,8 @@
 yet.
 
 Whether that is so is known for certain only once the numerical libraries are loaded, which takes
-seconds; a mark in the cache tells at once. Where the mark is missing, and everything is compiled,
-the process ends soon.
+seconds; a mark in the cache tells at once. Where the mark is missing and what takes longest is
+compiled, the process ends soon.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from bayesoleo._worker_processes import begin_elsewhere
 
 #: What the process does: a module, and a function without arguments.
 ELSEWHERE = ("bayesoleo.discovery._compile_ahead", "compile_ahead")
-#: What was begun by this process: once is enough.
-_begun: list[str] = []
+#: Whether another process was begun by this one: once is enough.
+_begun: list[bool] = []
 
 
 def begin_early(jobs: int | None) -> bool:
@@ -34,7 +34,12 @@ def begin_early(jobs: int | None) -> bool:
     jobs : int, optional
         How many may work at once; alone nothing is begun.
     """
-    return not _mark().exists() and begin(jobs)
+    return not is_marked() and begin(jobs)
+
+
+def is_marked() -> bool:
+    """Whether what takes longest has been compiled before."""
+    return _mark().exists()
 
 
 def begin(jobs: int | None) -> bool:
@@ -42,13 +47,12 @@ def begin(jobs: int | None) -> bool:
     if min(thread_limit(), jobs or available_cores()) < 2:
         return False
     if not _begun:
-        _begun.append(ELSEWHERE[1])
-        begin_elsewhere(*ELSEWHERE)
-    return True
+        _begun.append(begin_elsewhere(*ELSEWHERE))
+    return _begun[0]
 
 
 def leave_mark() -> None:
-    """Say that everything is compiled."""
+    """Say that what takes longest is compiled."""
     with suppress(OSError):  # the next command looks once more
         mark = _mark()
         mark.parent.mkdir(parents=True, exist_ok=True)

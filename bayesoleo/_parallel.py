@@ -134,6 +134,12 @@ def thread_map[T, R](
         return _gather(_pool(jobs), function, work)
 
 
+def shared_size(count: int, most: int, jobs: int) -> int:
+    """Items of a task, so many at most, of which there are at least two for each thread: some take
+    a hundred times as long as others."""
+    return max(1, min(most, -(-count // (2 * jobs))))
+
+
 #: Whether the present thread is one of a pool.
 _here = threading.local()
 _pools: dict[int, ThreadPoolExecutor] = {}

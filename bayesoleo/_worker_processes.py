@@ -1,4 +1,4 @@
-"""Independent work of one calculation in several processes of this machine.
+"""Work of one calculation in several processes of this machine.
 
 Scores and estimates of candidate effects spend most of their time in Python, where threads wait
 for each other. The processes are kept for the next call, because to start one takes two seconds,
@@ -26,7 +26,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from typing import Any, BinaryIO, cast
+from typing import Any, BinaryIO, Self, cast
 
 import bayesoleo._parallel as parallel
 
@@ -386,44 +386,72 @@ class StandingCall[S, T, R]:
 class Beside[S, R]:
     """One long call that another process does while this one goes on.
 
-    Where no process is free, or one is lost, the call is done here when its result is asked for.
-
-    Parameters
-    ----------
-    function : callable
-        Of a module, so that another process finds it.
-    argument : object
-        Its only argument.
-    jobs : int, optional
-        As of :func:`process_map`; with one nothing is done beside.
+    The argument is taken as it is now: what this process changes of it meanwhile makes no
+    difference, even where the process is lost and the call is done here. Left by an exception, the
+    process is ended: nobody waits for what it does.
     """
 
-    def __init__(self, function: Callable[[S], R], argument: S, jobs: int | None = None) -> None:
-        jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
-        self._function, self._argument = function, argument
+    #: Processes up to which one long call and the work of this one take them all.
+    MOST = 3
+
+    def __init__(self, function: Callable[[S], R], message: bytes) -> None:
+        self._function, self._message = function, message
         self._found: list[tuple[str, Any]] = []
-        self._thread: threading.Thread | None = None
-        if jobs > 1 and _usable() and _in_use.acquire(blocking=False):
-            self._thread = threading.Thread(target=self._ask, daemon=True)
-            self._thread.start()
+        self._thread = threading.Thread(target=self._ask, daemon=True)
+        self._thread.start()
+
+    @classmethod
+    def begun(
+        cls, function: Callable[[S], R], argument: S, jobs: int | None = None
+    ) -> Beside[S, R] | None:
+        """The call, begun; None where this process is alone, has others enough for all, where they
+        are in use, or the argument cannot be sent.
+
+        Parameters
+        ----------
+        function : callable
+            Of a module, so that another process finds it.
+        argument : object
+            Its only argument.
+        jobs : int, optional
+            As of :func:`process_map`.
+        """
+        jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
+        if not 1 < jobs <= cls.MOST or not _usable() or not _in_use.acquire(blocking=False):
+            return None
+        try:
+            return cls(function, _sent((0, argument)))
+        except BaseException as error:
+            _in_use.release()
+            if isinstance(error, _LostError):
+                return None
+            raise
 
     def _ask(self) -> None:
         try:
             worker = _worker(0)
             worker.ask(_sent((_called, self._function, None)))
-            self._found.append(worker.ask(_sent((0, self._argument))))
+            self._found.append(worker.ask(self._message))
             worker.ask(_dumps((None, None, None)))  # it needs no memory until the next call
         except _LostError:
             _forget(0)
         finally:
             _in_use.release()
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is not None:
+            kill_processes()
+            self._thread.join()
+
     def result(self) -> R:
         """What came of it, or the exception that it raised, when it is done."""
-        if self._thread is not None:
-            self._thread.join()
+        self._thread.join()
         if not self._found:
-            self._found.append((_VALUE, self._function(self._argument)))
+            _, argument = _loads(self._message)
+            self._found.append((_VALUE, self._function(argument)))
         kind, value = self._found[0]
         if kind == _ERROR:
             raise value
@@ -524,13 +552,13 @@ if hasattr(os, "register_at_fork"):  # pipes belong to the process that made the
     os.register_at_fork(after_in_child=_workers.clear)
 
 
-def begin_elsewhere(module: str, function: str) -> None:
-    """Call a function without arguments in a process that nobody waits for.
+def begin_elsewhere(module: str, function: str) -> bool:
+    """Call a function without arguments in a process that nobody waits for; whether one was begun.
 
     It is killed where this process ends before it does.
     """
     if not _usable():
-        return
+        return False
     code = f"import json, sys; sys.path[:] = json.loads(sys.argv[1]); import {module} as m"
     with suppress(OSError):
         process = subprocess.Popen(
@@ -540,6 +568,8 @@ def begin_elsewhere(module: str, function: str) -> None:
             stderr=subprocess.DEVNULL,
         )
         atexit.register(_end, process)
+        return True
+    return False
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -9,8 +9,10 @@ import threading
 import time
 
 import pytest
+from scipy.special import erfcx
 
 from bayesoleo import _compiled as compiled
+from bayesoleo.discovery._structure_moments import _scaled_tail
 
 HOLD = """
 import sys, time
@@ -83,16 +85,44 @@ def test_an_error_within_is_passed_on(cache):
         raise FileNotFoundError(os.fspath(cache))  # not taken for a disk without locks
 
 
-@pytest.mark.skipif(not hasattr(compiled._fill, "signatures"), reason="nothing is compiled")
-def test_the_level_of_optimisation_is_given_back():
+class Dispatcher:
+    """As Numba's, as far as it is used: what it compiles, and whether that is on disk."""
+
+    def __init__(self, compile_one, known=False):
+        self.py_func, self.compile, self.targetctx = entered, compile_one, None
+        self._cache = self
+        self.known = known
+
+    def holds(self, *_):
+        return self.known
+
+
+def test_the_level_of_optimisation_is_given_back(cache):
     config = compiled._config
     before = config.OPT
     seen = []
-    compile_one = compiled._compiler_of(entered, lambda _: seen.append(int(config.OPT)))
-    compile_one(None)
+    compiled._compiler_of(Dispatcher(lambda _: seen.append(int(config.OPT))))(None)
     assert seen == [min(int(before), compiled.LEVEL)]
     assert before == config.OPT
     with pytest.raises(ZeroDivisionError):
-        compiled._compiler_of(entered, lambda _: 1 // 0)(None)
+        compiled._compiler_of(Dispatcher(lambda _: 1 // 0))(None)
     assert before == config.OPT
     assert not compiled._compiling
+
+
+def test_what_is_on_disk_is_not_waited_for_and_waiting_is_told(cache, monkeypatch):
+    asked, told = [], []
+    monkeypatch.setattr(compiled, "_locked", lambda *_: asked.append(1) or len(asked) > 1)
+    with compiled.compilation_told(told.append):
+        compiled._compiler_of(Dispatcher(lambda _: None, known=True))(None)
+        assert (asked, told) == ([], [])
+        compiled._compiler_of(Dispatcher(lambda _: None))(None)
+    assert (len(asked), told) == (2, [compiled.COMPILED_ONCE])
+
+
+@pytest.mark.skipif(not hasattr(_scaled_tail, "signatures"), reason="nothing is compiled")
+def test_a_function_that_was_compiled_is_held_for_its_types_alone():
+    assert _scaled_tail(1.0) == pytest.approx(erfcx(1.0), rel=1e-14)
+    (signature, *_) = _scaled_tail.signatures
+    assert _scaled_tail._cache.holds(signature, _scaled_tail.targetctx)
+    assert not _scaled_tail._cache.holds((*signature, *signature), _scaled_tail.targetctx)

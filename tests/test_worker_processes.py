@@ -286,41 +286,61 @@ def test_the_largest_of_several_comes_back_as_it_was():
 def where_and_twice(value):
     if value == "wrong":
         raise ValueError(value)
+    if isinstance(value, list):
+        return os.getpid(), 2 * value[0]
     return os.getpid(), 2 * value
 
 
 def test_a_long_call_is_done_beside(eager):
-    pid, value = processes.Beside(where_and_twice, 21, 2).result()
+    pid, value = processes.Beside.begun(where_and_twice, 21, 2).result()
     assert value == 42
     assert pid != os.getpid()
-    assert processes.Beside(where_and_twice, 1, 2).result() == (pid, 2)  # it is free again
+    assert processes.Beside.begun(where_and_twice, 1, 2).result() == (pid, 2)  # it is free again
 
 
 def test_what_it_raises_is_raised_where_the_result_is_asked_for(eager):
-    beside = processes.Beside(where_and_twice, "wrong", 2)
+    beside = processes.Beside.begun(where_and_twice, "wrong", 2)
     with pytest.raises(ValueError, match="wrong"):
         beside.result()
-    assert processes.Beside(where_and_twice, 3, 2).result()[1] == 6
+    assert processes.Beside.begun(where_and_twice, 3, 2).result()[1] == 6
 
 
-@pytest.mark.parametrize("reason", ["one job", "busy", "lost", "cannot be sent"])
-def test_a_call_that_cannot_be_done_beside_is_done_here(eager, monkeypatch, reason):
-    jobs = 1 if reason == "one job" else 2
-    if reason == "busy":
-        other = processes.Beside(time.sleep, 0.5, 2)
-    if reason == "lost":
+@pytest.mark.parametrize("lost", [False, True])
+def test_the_argument_is_taken_as_it_was(eager, monkeypatch, lost):
+    """What this process does to it meanwhile counts nowhere, in the other process or here."""
+    if lost:
         processes._worker(0).process.kill()
         monkeypatch.setattr(processes, "_worker", lambda number: processes._workers[number])
-    function = (lambda value: threading.Lock() and (os.getpid(), 2 * value)) if (
-        reason == "cannot be sent"
-    ) else where_and_twice  # fmt: skip
-    argument = Unsendable(4) if reason == "cannot be sent" else 4
-    beside = processes.Beside(function, argument, jobs)
-    assert beside.result() == beside.result() == (os.getpid(), 8)
-    if reason == "busy":
-        assert other.result() is None
+    argument = [4]
+    beside = processes.Beside.begun(where_and_twice, argument, 2)
+    argument[0] = 7
+    pid, value = beside.result()
+    assert beside.result() == (pid, value)
+    assert value == 8
+    assert (pid == os.getpid()) == lost
 
 
 class Unsendable(int):
     def __reduce__(self):
         raise TypeError("it stays here")
+
+
+@pytest.mark.parametrize("reason", ["one job", "many jobs", "cannot be sent", "forbidden"])
+def test_nothing_is_begun_beside_where_that_makes_no_sense(eager, monkeypatch, reason):
+    jobs = {"one job": 1, "many jobs": 8}.get(reason, 2)
+    monkeypatch.setattr(processes.parallel, "thread_limit", lambda: 8)
+    if reason == "forbidden":
+        monkeypatch.setenv("BAYESOLEO_PROCESSES", "0")
+    argument = Unsendable(4) if reason == "cannot be sent" else 4
+    assert processes.Beside.begun(where_and_twice, argument, jobs) is None
+    monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
+    other = processes.Beside.begun(where_and_twice, 1, 2)  # the processes are free
+    assert processes.Beside.begun(where_and_twice, 1, 2) is None or not processes._in_use.locked()
+    assert other.result()[1] == 2
+
+
+def test_one_that_nobody_waits_for_is_ended(eager):
+    with pytest.raises(KeyboardInterrupt), processes.Beside.begun(time.sleep, 60.0, 2):
+        raise KeyboardInterrupt
+    assert not processes._in_use.locked()
+    assert processes.Beside.begun(where_and_twice, 5, 2).result()[1] == 10

@@ -261,14 +261,16 @@ def demo(
       bayesoleo demo
       bayesoleo demo --seed 3 --out /tmp/demo
     """
+    from bayesoleo._compiled import compilation_told
     from bayesoleo._workflow.model_files import load_model
     from bayesoleo._workflow.simulating import demo_campaign
-    from bayesoleo.discovery._compile_ahead import begin_compiling
+    from bayesoleo.discovery._compile_ahead import begin_compiling, compile_meanwhile
 
     shell.check_writable(out)
     begin_compiling(chosen.jobs)
     chosen = replace(chosen, quick=not full)
-    with shell.stoppable(out, quiet) as told:
+    with shell.stoppable(out, quiet) as told, compilation_told(told["callback"]):
+        compile_meanwhile(chosen.jobs)
         told["callback"]("simulating a shaker campaign of an oleo")
         campaign = _fresh_campaign(out, chosen.seed, demo_campaign)
         _closed(campaign, load_model(DEMO_SYSTEM), chosen, out, told, as_json)

@@ -10,14 +10,15 @@ import math
 import os
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
 import xarray as xr
 
+from bayesoleo._first_compilation import is_marked
 from bayesoleo._types import ProgressCallback
-from bayesoleo._worker_processes import Beside, start_ahead
+from bayesoleo._worker_processes import start_ahead
 from bayesoleo._workflow.estimating import NOT_SAMPLED, draw, inference_for
 from bayesoleo._workflow.output import (
     POSTERIOR_STAGE,
@@ -35,8 +36,9 @@ from bayesoleo._workflow.output import (
     write_result,
 )
 from bayesoleo._workflow.settings import Settings
-from bayesoleo._workflow.structures_beside import Answer, Asked, answer_later
+from bayesoleo._workflow.structures_beside import Answer, Asked, answered, begun_beside
 from bayesoleo._workflow.task import Source, Task, prepare, silent
+from bayesoleo.discovery._compile_ahead import compile_meanwhile
 from bayesoleo.discovery._inference import CATALOGUE
 from bayesoleo.discovery._loop import (
     ClosedLoop,
@@ -130,8 +132,10 @@ def close(
         summary says in ``unfinished`` what is missing and why; it is written like any other.
     """
     output = ResultFolder.checked(out)
+    if is_marked():
+        start_ahead(jobs=settings.jobs)
     task = prepare(campaign, model, settings, progress=progress)
-    start_ahead(jobs=settings.jobs)
+    start_ahead(jobs=settings.jobs)  # else once less is compiled at the same time
     _check_aim(task)
     with output.alone():
         stages, begun = Stages(callback), time.monotonic()
@@ -141,39 +145,52 @@ def close(
         ask = Asked(
             loop, settings.numerics, settings.structure_prior, task.campaign.rig, settings.next_run
         )
-        later, place = answer_later(ask, settings.jobs), output.checkpoints
-        keep = not settings.quick or time.monotonic() - begun > WORTH_KEEPING
-        if keep:
-            loop, questions = with_structures(task, loop, later, stages)
+        # A search that took long is written with its probabilities before the draws.
+        first = not settings.quick or time.monotonic() - begun > WORTH_KEEPING
+        beside = None if first else begun_beside(ask, settings.jobs)
+        questions, groups, place = no_questions(), None, output.checkpoints
+        if beside is None:
+            loop, questions = with_structures(task, loop, answered(ask, callback), stages)
+        if first:
             _write_found(task, loop, output, stages, questions)
         callback("sample the posterior")
-        drawn = stages.attempt(
-            POSTERIOR_STAGE, lambda: draw_final(task, loop, place, callback, progress), lambda: None
-        )
-        groups = None
-        with suppress(Exception):  # it is made again where what fails is told
-            groups = result_groups(task, loop, drawn, stages)
-        if not keep:
-            loop, questions = with_structures(task, loop, later, stages)
+        with beside or nullcontext():
+            drawn = stages.attempt(
+                POSTERIOR_STAGE,
+                lambda: draw_final(task, loop, place, callback, progress),
+                lambda: None,
+            )
+            if beside is not None:
+                groups = _groups_of(task, loop, drawn, stages)
+                callback("compare structures")
+                loop, questions = with_structures(task, loop, beside.result(), stages)
         return written(task, loop, drawn, output, stages, questions, groups)
 
 
+def _groups_of(task: Task, loop: ClosedLoop, drawn: Drawn | None, stages: Stages) -> Groups | None:
+    """What does not depend on structures; None where that fails, which is told when it is made
+    again."""
+    failed = len(stages.failed)
+    try:
+        return result_groups(task, loop, drawn, stages)
+    except Exception:
+        del stages.failed[failed:]
+        return None
+
+
 def with_structures(
-    task: Task, loop: ClosedLoop, later: Beside[Asked, Answer] | None, stages: Stages
+    task: Task, loop: ClosedLoop, found: Answer | None, stages: Stages
 ) -> tuple[ClosedLoop, tuple[Question, ...]]:
     """The loop with the probabilities, and the runs that would tell apart what is left."""
-    if later is None:
+    if found is None:  # the loop had them, or has none
         return loop, asked(task, loop, stages)
-    stages.callback("compare structures")
-    try:
-        found = later.result()
-    except Exception as error:
+    failure = found.failure
+    if failure is not None and failure.stage == SEARCH_STAGE:
         assert loop.without_structures is not None
-        return _broken_off(loop.without_structures, task, stages, error), ()
-    loop = judged(loop, found.structures)
-    if not loop.complete:
-        return loop, ()
-    return loop, stages.attempt(PROPOSALS_STAGE, found.asked, no_questions)
+        return _broken_off(loop.without_structures, task, stages, failure.error, failure.reason), ()
+    if failure is not None:
+        stages.fail(failure.stage, failure.reason, failure.error)
+    return judged(loop, found.structures), found.questions
 
 
 def draw_final(
@@ -322,6 +339,7 @@ def run_loop(
         reached.append(progress)
         write_so_far(task, progress, output, callback, resume=resume)
 
+    compile_meanwhile(settings.jobs)
     try:
         return close_loop(
             task.assembly,
@@ -343,12 +361,13 @@ def run_loop(
     except Exception as error:
         if not reached:
             raise
-        return _broken_off(reached[-1], task, stages, error)
+        return _broken_off(reached[-1], task, stages, error, reason_of(error))
 
 
-def _broken_off(reached: Progress, task: Task, stages: Stages, error: Exception) -> ClosedLoop:
+def _broken_off(
+    reached: Progress, task: Task, stages: Stages, error: Exception, reason: str
+) -> ClosedLoop:
     """What a search had found when it failed."""
-    reason = reason_of(error)
     stages.fail(SEARCH_STAGE, reason, error)
     return loop_of(reached.ended(f"the search broke off here: {reason}"), task.roles)
 

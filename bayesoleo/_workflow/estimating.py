@@ -28,6 +28,7 @@ from bayesoleo._workflow.output import (
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.task import Source, Task, prepare, silent
 from bayesoleo.discovery._assembly import Assembly
+from bayesoleo.discovery._compile_ahead import compile_meanwhile
 from bayesoleo.discovery._fewest_steps import for_sampling
 from bayesoleo.discovery._fit import ModelFit, fit_model
 from bayesoleo.discovery._inference import (
@@ -102,6 +103,7 @@ def estimated(
     """The estimate, at the mode under the error model that was chosen if that was found."""
     settings, callback = task.settings, stages.callback
     model, runs = task.assembly.model(), task.roles.fitted
+    compile_meanwhile(settings.jobs)
     fit = fit_model(model, runs, settings.numerics, method=method, progress=callback)
     if method == "mbe":  # what a search begins with
         task.keep(fit)

@@ -229,7 +229,7 @@ def search_key(task: Task) -> dict[str, str]:
     }
 
 
-#: In the order in which they are done; those of the schema of the summary.
+#: Those of the schema of the summary, in the order in which a run that is not quick does them.
 SEARCH_STAGE, PROPOSALS_STAGE, POSTERIOR_STAGE, PREDICTIONS_STAGE, REPORT_STAGE = (
     "search",
     "proposals",

@@ -7,7 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from bayesoleo._parallel import single_blas_thread
+from bayesoleo._types import ProgressCallback
 from bayesoleo._worker_processes import Beside
+from bayesoleo._workflow.output import PROPOSALS_STAGE, SEARCH_STAGE, reason_of
 from bayesoleo.discovery._loop import ClosedLoop, judged, structures_of
 from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._open_questions import Question, questions_of
@@ -39,6 +41,22 @@ class Asked:
 
 
 @dataclass(frozen=True)
+class Failure:
+    """A stage that failed.
+
+    Parameters
+    ----------
+    stage, reason : str
+        The reason names the place in the code, which an error forgets on its way here.
+    error : Exception
+    """
+
+    stage: str
+    reason: str
+    error: Exception
+
+
+@dataclass(frozen=True)
 class Answer:
     """What it answers.
 
@@ -47,34 +65,39 @@ class Answer:
     structures : StructurePosterior, str or None
         As of :func:`~bayesoleo.discovery._loop.structures_of`.
     questions : tuple of Question
-    failed : Exception or None
-        Why there are no questions.
+    failure : Failure or None
+        Of the stage ``search``, without structures, or ``proposals``, without questions.
     """
 
-    structures: StructurePosterior | str | None
+    structures: StructurePosterior | str | None = None
     questions: tuple[Question, ...] = ()
-    failed: Exception | None = None
-
-    def asked(self) -> tuple[Question, ...]:
-        """The questions, or the error on the way to them."""
-        if self.failed is not None:
-            raise self.failed
-        return self.questions
+    failure: Failure | None = None
 
 
 @single_blas_thread()  # as in the process that goes on meanwhile
-def answer(asked: Asked) -> Answer:
-    """Compare structures, then look for runs; nobody is told how far it has come."""
-    loop = asked.loop
+def answer(asked: Asked, callback: ProgressCallback = lambda _: None) -> Answer:
+    """Compare structures, then look for runs."""
+    loop, found, stage = asked.loop, None, SEARCH_STAGE
     assert loop.without_structures is not None
-    found = structures_of(loop.without_structures, asked.numerics, asked.prior)
     try:
-        questions = questions_of(judged(loop, found), asked.rig, asked.numerics, aim=asked.aim)
+        found = structures_of(loop.without_structures, asked.numerics, asked.prior, callback)
+        loop, stage = judged(loop, found), PROPOSALS_STAGE
+        if not loop.complete:
+            return Answer(found)
+        questions = questions_of(loop, asked.rig, asked.numerics, aim=asked.aim, callback=callback)
     except Exception as error:
-        return Answer(found, failed=error)
+        return Answer(found, failure=Failure(stage, reason_of(error), error))
     return Answer(found, questions)
 
 
-def answer_later(asked: Asked, jobs: int | None) -> Beside[Asked, Answer] | None:
-    """The answer when it is asked for; None where the loop has structures, or there are none."""
-    return None if asked.loop.without_structures is None else Beside(answer, asked, jobs)
+def answered(asked: Asked, callback: ProgressCallback) -> Answer | None:
+    """The answer, found here; None where nothing is asked."""
+    return None if asked.loop.without_structures is None else answer(asked, callback)
+
+
+def begun_beside(asked: Asked, jobs: int | None) -> Beside[Asked, Answer] | None:
+    """The answer, which another process begins to look for; None where that has to be done here, or
+    nothing is asked. Nobody is told how far the other process has come."""
+    if asked.loop.without_structures is None:
+        return None
+    return Beside.begun(answer, asked, jobs)

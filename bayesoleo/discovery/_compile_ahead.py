@@ -21,22 +21,33 @@ if TYPE_CHECKING:
 
 
 def begin_compiling(jobs: int | None) -> None:
-    """Compile in another process and in this one, where nothing is compiled yet.
+    """Begin to compile in another process, where nothing is compiled yet.
 
     Parameters
     ----------
     jobs : int, optional
         How many may work at once; alone nothing is compiled before it is needed.
     """
-    if is_compiled(beside) and is_compiled(close_and_sweep):
+    if _is_done():
         first_compilation.leave_mark()
-    elif first_compilation.begin(jobs):
+    else:
+        first_compilation.begin(jobs)
+
+
+def compile_meanwhile(jobs: int | None) -> None:
+    """Compile in this process what the other one leaves to it, before an estimate needs both."""
+    if not _is_done() and first_compilation.begin(jobs):
         compile_here()
+
+
+def _is_done() -> bool:
+    """Whether what the other process compiles first and last is there."""
+    return is_compiled(beside) and is_compiled(close_and_sweep)
 
 
 def compile_ahead() -> None:
     """Compile in a process of its own what takes longest, in the order of need."""
-    if is_compiled(beside) and is_compiled(close_and_sweep):
+    if _is_done():
         first_compilation.leave_mark()
         return
     run = _oscillator()

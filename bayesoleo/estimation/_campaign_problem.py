@@ -99,7 +99,7 @@ class CampaignProblem:
 
     @contextmanager
     def unwatched(self) -> Iterator[None]:
-        """Look for no jumps between branches meanwhile."""
+        """Only compare solutions meanwhile; see the function of that name."""
         before = [run.watched for run in self.predictor.runs]
         for run in self.predictor.runs:
             run.watched = False
@@ -201,9 +201,9 @@ class CampaignProblem:
             sums[lanes, r] = np.sum(residual**2, axis=2)
             return status
 
-        worst = self.predictor.by_blocks(len(theta), _LANES, squares)
-        sums[worst != Status.CONVERGED] = np.nan
-        return Misfit(sums, worst)
+        status = self.predictor.by_blocks(len(theta), _LANES, squares)
+        sums[status != Status.CONVERGED] = np.nan
+        return Misfit(sums, status)
 
     @property
     def samples(self) -> tuple[RunSamples, ...]:

@@ -104,13 +104,15 @@ def stability_changes_of(problem: EstimationProblem) -> Int[Integers, " runs"]:
 
 
 def unwatched(problem: object) -> AbstractContextManager[None]:
-    """Look for no jumps between branches meanwhile, where a problem looks for them.
+    """Only compare solutions meanwhile, where a problem does more.
 
     Parameters
     ----------
     problem : EstimationProblem or Density
         A campaign's counts the solutions that left their branch, and far from the anchor that takes
-        longer than the solutions.
+        longer than the solutions. It also seeks motions where an elimination has to exchange rows,
+        which may take a hundred times as long: meanwhile it gives such vectors up where a run has
+        many steps, or on a path from the anchor.
     """
     found: AbstractContextManager[None] = getattr(problem, "unwatched", nullcontext)()
     return found
@@ -314,7 +316,7 @@ class Held(SameData):
         return stability_changes_of(self.problem)
 
     def unwatched(self) -> AbstractContextManager[None]:
-        """Look for no jumps between branches meanwhile."""
+        """Only compare solutions meanwhile."""
         return unwatched(self.problem)
 
     def misfit(self, theta: Array) -> Misfit:

@@ -17,7 +17,7 @@ from typing import Protocol, cast
 import numpy as np
 
 from bayesoleo import _schema as schema
-from bayesoleo._parallel import available_cores, thread_map
+from bayesoleo._parallel import available_cores, shared_size, thread_map
 from bayesoleo._types import Array, Float, Integers
 from bayesoleo.error_models._base import ErrorModel
 from bayesoleo.error_models._registry import error_model
@@ -357,7 +357,7 @@ class LogDensity:
         return int(jumps_of(self.problem).sum())
 
     def unwatched(self) -> AbstractContextManager[None]:
-        """Look for no jumps between branches meanwhile."""
+        """Only compare solutions meanwhile; fewer vectors may have one."""
         return unwatched(self.problem)
 
     def natural(
@@ -442,25 +442,21 @@ class LogDensity:
         )
 
     def _of_residuals(self, theta: Array, eta: Array) -> tuple[Array, Integers]:
-        """Log-likelihood by run (W, N) and statuses (W,), in blocks of rows; where these are few
-        and runs do not depend on each other, of single runs."""
-        same, runs = SameUnknowns.of(theta), range(len(self.runs))
-        by_run = np.full((len(theta), len(runs)), np.nan)
-        status = np.zeros((len(theta), len(runs)), dtype=np.int64)
-        blocks = same.blocks(LANES)
-        together = self.errors.over_runs or len(blocks) >= available_cores()
-        parts: list[Sequence[int]] = [runs] if together else [(run,) for run in runs]
+        """Log-likelihood by run (W, N) and statuses (W,), in blocks of rows."""
+        same, runs = SameUnknowns.of(theta), len(self.runs)
+        by_run = np.full((len(theta), runs), np.nan)
+        status = np.zeros((len(theta), runs), dtype=np.int64)
 
-        def work(task: tuple[Sequence[int], Block]) -> None:
+        def work(block: Block) -> None:
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                self._of_block(*task, same.theta, eta, by_run, status)
+                self._of_block(block, same.theta, eta, by_run, status)
 
-        thread_map(work, [(part, block) for part in parts for block in blocks], self.jobs)
+        size = shared_size(len(same.theta), LANES, self.jobs or available_cores())
+        thread_map(work, same.blocks(size), self.jobs)
         return by_run, first_failure(status)
 
     def _of_block(
         self,
-        runs: Sequence[int],
         block: Block,
         theta: Array,
         eta: Array,
@@ -471,7 +467,7 @@ class LogDensity:
         needs none of those after it."""
         problem, errors = cast(ResidualProblem, self.problem), self.errors
         found: list[Array] = []
-        for run in runs:
+        for run in range(len(self.runs)):
             residual, failed = problem.residuals(theta[block.lanes], run)
             if failed.any():
                 status[block.rows, run] = failed[block.of_row]

@@ -66,7 +66,9 @@ class SameUnknowns:
         return cls(found, of_row.reshape(-1))
 
     def blocks(self, size: int) -> list[Block]:
-        """Blocks of so many vectors."""
+        """Blocks of so many vectors; none of no rows."""
+        if not len(self.theta):
+            return []
         order = np.argsort(self.of_row, kind="stable")
         starts = range(0, len(self.theta), size)
         cuts = np.searchsorted(self.of_row[order], starts[1:])

@@ -106,7 +106,8 @@ class RunPredictor:
 
     #: Solutions so far that left the branch of the anchor from which they were started or changed
     #: its stability, those that did the latter only, and whether they are looked for: where a
-    #: solution is known, it costs more than the solution.
+    #: solution is known, it costs more than the solution. What is not watched is only compared, and
+    #: given up sooner.
     jumps, changes, watched = 0, 0, True
     #: How often a motion may still be sought by shooting; None for any number.
     shots: int | None = None

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesoleo._parallel import available_cores, thread_map
+from bayesoleo._parallel import available_cores, shared_size, thread_map
 from bayesoleo._types import Array, Float, Int, Integers
 from bayesoleo.errors import ModelError
 from bayesoleo.model._drive_and_start import start_parameters
@@ -28,8 +28,6 @@ from bayesoleo.solvers._schemes import COLLOCATION, DEFAULT_SCHEME
 
 #: Parameter vectors of one task: enough to share a run's inputs, few enough to stay in the cache.
 BLOCK = 32
-#: Fewest of them where a smaller task would serve more threads.
-LEAST = 4
 
 
 @dataclass(frozen=True)
@@ -360,14 +358,14 @@ class Predictor:
             total[lanes, r], status = self.runs[r].squares(self.constants(theta[lanes], r))
             return status
 
-        worst = self.by_blocks(len(theta), BLOCK, squares)
-        total[worst != Status.CONVERGED.value] = np.nan
-        return total, worst
+        status = self.by_blocks(len(theta), BLOCK, squares)
+        total[status != Status.CONVERGED.value] = np.nan
+        return total, status
 
     def by_blocks(
         self, count: int, size: int, solve: Callable[[int, Integers], Integers]
     ) -> Int[Integers, " vectors"]:
-        """Solve blocks of vectors in threads; where there are few, of single runs.
+        """Solve blocks of vectors in threads, run by run.
 
         A vector that has no solution of one run is left out of those after it.
 
@@ -386,21 +384,15 @@ class Predictor:
             The first failure of each vector: it does not depend on the blocks.
         """
         status = np.zeros((count, len(self.runs)), dtype=np.int64)
-        jobs = self.jobs or available_cores()
-        # Some take a hundred times as long as others: several blocks for each thread.
-        size = min(size, max(LEAST, -(-count // (2 * jobs))))
-        blocks = [np.arange(k, min(k + size, count)) for k in range(0, count, size)]
-        every = range(len(self.runs))
-        together = len(blocks) >= jobs
-        parts: list[Sequence[int]] = [every] if together else [(r,) for r in every]
+        size = shared_size(count, size, self.jobs or available_cores())
 
-        def work(task: tuple[Sequence[int], Integers]) -> None:
-            runs, lanes = task
-            for r in runs:
+        def work(start: int) -> None:
+            lanes = np.arange(start, min(start + size, count))
+            for r in range(len(self.runs)):
                 if not lanes.size:
                     return
                 status[lanes, r] = solve(r, lanes)
                 lanes = lanes[status[lanes, r] == Status.CONVERGED.value]
 
-        thread_map(work, [(runs, block) for runs in parts for block in blocks], self.jobs)
+        thread_map(work, range(0, count, size), self.jobs)
         return first_failure(status)

@@ -13,9 +13,10 @@ discretisation error is estimated once, at the point estimate.
 from __future__ import annotations
 
 import threading
+import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Protocol, cast
 
 import numpy as np
@@ -51,7 +52,7 @@ MOST_LINES = 256
 TOLERANCE = 1e-6
 #: Points of a run at which its equations are looked at: every run of every fit is.
 LOOKS = 16_384
-#: Bytes of draws that are kept for the next model of a run.
+#: Bytes of draws, and of changes by harmonics, that are kept for the next model of a run.
 MOST_KEPT = 3e8
 #: Coefficients of an input for which states are solved together.
 TOGETHER = 32
@@ -366,11 +367,13 @@ _errors = _Draws(MOST_KEPT)
 
 class _HarmonicChanges:
     """Changes by the harmonics of runs, those asked for last: each model of a run asks for them
-    again, and of a broadband input they take as long as the states."""
+    again, and of a broadband input they take as long as the states. They go with the run."""
 
     def __init__(self, most: float):
-        self.most, self.lock = most, threading.Lock()
-        self.kept: OrderedDict[tuple[object, ...], tuple[Record, Array]] = OrderedDict()
+        # A run may go while this one holds it: then its thread asks again.
+        self.most, self.lock = most, threading.RLock()
+        self.kept: OrderedDict[tuple[int, object], Array] = OrderedDict()
+        self.runs: dict[int, weakref.ref[Record]] = {}
 
     def of(
         self,
@@ -381,24 +384,28 @@ class _HarmonicChanges:
         phase: Array,
     ) -> Array:
         """See :func:`_harmonic_changes`; not to be written to."""
-        # The record is kept too, so that no other one gets its number.
-        key = id(record), channel, highest, derivatives, phase.tobytes(), MOST_LINES
+        key = id(record), (channel, highest, derivatives, phase.tobytes(), MOST_LINES)
         with self.lock:
             if key in self.kept:
                 self.kept.move_to_end(key)
-                return self.kept[key][1]
+                return self.kept[key]
         item = harmonics_of(record, channel).for_derivative(highest)
         found = _harmonic_changes(item, record.frequency, derivatives, phase)
         found.flags.writeable = False
         with self.lock:
-            self.kept[key] = record, found
-            while len(self.kept) > 1 and self._size() > self.most:
+            if key[0] not in self.runs:
+                self.runs[key[0]] = weakref.ref(record, partial(self._forget, key[0]))
+            self.kept[key] = found
+            while len(self.kept) > 1 and sum(x.nbytes for x in self.kept.values()) > self.most:
                 self.kept.popitem(last=False)
         return found
 
-    def _size(self) -> int:
-        """Bytes of what is kept."""
-        return sum(found.nbytes for _, found in self.kept.values())
+    def _forget(self, number: int, _: object) -> None:
+        """Of a run that is no more, before another one has its number."""
+        with self.lock:
+            self.runs.pop(number, None)
+            for key in [key for key in self.kept if key[0] == number]:
+                del self.kept[key]
 
 
 _harmonics = _HarmonicChanges(MOST_KEPT)

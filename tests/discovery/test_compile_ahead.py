@@ -80,7 +80,10 @@ def test_two_processes_compile_everything_once(tmp_path):
         assert len(own) == 1, name
     assert list(tmp_path.glob("compiled-*"))
     before = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.nb[ic]")}
-    run(code.format("begin_compiling(2) or ahead.compile_here"), tmp_path)
+    run(
+        code.format("compile_meanwhile(2) or ahead.begin_compiling(2) or ahead.compile_here"),
+        tmp_path,
+    )
     assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.nb[ic]")} == before
 
 
@@ -90,8 +93,13 @@ def test_two_processes_compile_everything_once(tmp_path):
 )
 def test_it_is_begun_where_it_helps(monkeypatch, tmp_path, jobs, compiled, begun):
     asked, here = [], []
+
+    def elsewhere(*call):
+        asked.append(call)
+        return True
+
     monkeypatch.setenv("BAYESOLEO_CACHE", str(tmp_path))
-    monkeypatch.setattr(first, "begin_elsewhere", lambda *call: asked.append(call))
+    monkeypatch.setattr(first, "begin_elsewhere", elsewhere)
     monkeypatch.setattr(first, "thread_limit", lambda: 2)
     monkeypatch.setattr(first, "_begun", [])
     monkeypatch.setattr(ahead, "is_compiled", lambda _: compiled)
@@ -99,6 +107,8 @@ def test_it_is_begun_where_it_helps(monkeypatch, tmp_path, jobs, compiled, begun
     assert first.begin_early(jobs) == (jobs > 1)  # nothing is known yet
     assert len(asked) == (jobs > 1)
     ahead.begin_compiling(jobs)
+    assert not here  # before the input has been looked at
+    ahead.compile_meanwhile(jobs)
     ahead.begin_compiling(jobs)  # the search after a simulation
     assert len(asked) == (jobs > 1)
     assert bool(here) == begun
@@ -109,3 +119,15 @@ def test_it_is_begun_where_it_helps(monkeypatch, tmp_path, jobs, compiled, begun
     asked.clear()
     assert first.begin_early(jobs) == (jobs > 1 and not compiled)
     assert len(asked) == (jobs > 1 and not compiled)
+
+
+def test_where_no_process_may_be_begun_everything_is_compiled_when_it_is_needed(
+    monkeypatch, tmp_path
+):
+    monkeypatch.setenv("BAYESOLEO_CACHE", str(tmp_path))
+    monkeypatch.setenv("BAYESOLEO_PROCESSES", "0")
+    monkeypatch.setattr(first, "_begun", [])
+    monkeypatch.setattr(ahead, "is_compiled", lambda _: False)
+    monkeypatch.setattr(ahead, "compile_here", lambda: pytest.fail("nobody compiles the rest"))
+    assert not first.begin_early(2)
+    ahead.compile_meanwhile(2)

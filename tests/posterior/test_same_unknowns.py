@@ -8,7 +8,7 @@ from linear_runs import linear_runs
 
 from bayesoleo.error_models._base import Frame
 from bayesoleo.error_models._independent import IndependentErrors, log_likelihood_by_run
-from bayesoleo.posterior import LogDensity, _log_density as log_densities
+from bayesoleo.posterior import LogDensity
 from bayesoleo.posterior._same_unknowns import SameUnknowns
 from bayesoleo.solvers._orbit import Status, first_failure
 
@@ -56,11 +56,10 @@ class OverRuns(ByResiduals):
 
 
 @pytest.fixture(params=[ByResiduals, OverRuns])
-def density(problem, request, monkeypatch):
-    def of(failing=(), cores=1):
-        monkeypatch.setattr(log_densities, "available_cores", lambda: cores)
+def density(problem, request):
+    def of(failing=(), jobs=1):
         watched = Watched(problem, dict(failing))
-        return LogDensity(watched, 1, errors=request.param(Frame.of(problem))), watched
+        return LogDensity(watched, jobs, errors=request.param(Frame.of(problem))), watched
 
     return of
 
@@ -87,6 +86,10 @@ def test_equal_vectors_are_found_in_any_order():
         assert set(left.rows) < set(block.rows)
 
 
+def test_no_rows_have_no_blocks():
+    assert SameUnknowns.of(np.zeros((0, 3))).blocks(8) == []
+
+
 def test_each_vector_is_solved_once_and_each_row_has_its_own_value(density):
     vectors = np.linspace(0.5, 2.0, 11)
     log_density, watched = density()
@@ -101,12 +104,10 @@ def test_each_vector_is_solved_once_and_each_row_has_its_own_value(density):
     assert len(np.unique(value)) == len(phi)
 
 
-@pytest.mark.parametrize("cores", [1, 64])
-def test_a_vector_without_a_solution_costs_one_run(density, cores):
-    """Where there are fewer blocks than cores, runs are solved side by side; what is said of a
-    failure is the same."""
+@pytest.mark.parametrize("jobs", [1, 3, 64])
+def test_a_vector_without_a_solution_costs_one_run(density, jobs):
     failing = {1.0: (1, Status.SINGULAR), 2.0: (0, Status.INADMISSIBLE)}
-    log_density, watched = density(failing, cores=cores)
+    log_density, watched = density(failing, jobs=jobs)
     phi = rows_of(log_density, np.array([0.5, 1.0, 1.5, 2.0]), 3)
     value, by_run = log_density(phi)
     lost = np.isin(phi[:, 0], (1.0, 2.0))
@@ -115,9 +116,8 @@ def test_a_vector_without_a_solution_costs_one_run(density, cores):
     assert log_density.failures == {"singular": 3, "inadmissible": 3}
     clean, _ = density()
     np.testing.assert_array_equal(value[~lost], clean(phi[~lost])[0])
-    if cores == 1 or log_density.errors.over_runs:
-        assert {run for run, vector in watched.asked if vector == 1.0} == {0, 1}
-        assert {run for run, vector in watched.asked if vector == 2.0} == {0}
+    assert {run for run, vector in watched.asked if vector == 1.0} == {0, 1}
+    assert {run for run, vector in watched.asked if vector == 2.0} == {0}
 
 
 def test_the_first_failure_of_several_is_told():

@@ -1,5 +1,6 @@
 """A measured channel as an input at another one's harmonics: what a frame's compliance needs."""
 
+import gc
 from dataclasses import replace
 
 import numpy as np
@@ -186,6 +187,17 @@ def test_changes_by_harmonics_are_kept_for_the_next_model_and_not_for_another_ru
     assert kept.of(record, *asked[0]) is found[0]
     with pytest.raises(ValueError, match="read-only"):
         found[0][0] = 0.0
+
+
+def test_changes_by_harmonics_go_with_their_run(record):
+    kept, phase = _run_errors._HarmonicChanges(1e6), np.linspace(0, 1, 9)
+    other = replace(record, frequency=2.0)
+    for one in (record, other):
+        kept.of(one, "force", 1, (0, 1), phase)
+    assert len(kept.kept) == len(kept.runs) == 2
+    del one, other
+    gc.collect()
+    assert len(kept.kept) == len(kept.runs) == 1
 
 
 def test_no_more_changes_are_kept_than_fit(record):
