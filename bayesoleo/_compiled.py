@@ -77,18 +77,25 @@ class _CheckedFile(_CacheFile):  # type: ignore[misc]
         write_durably(Path(self._data_path(name)), sealed(self._dump(data)))
 
 
-#: Told once that something is compiled.
+#: Told once that something is compiled, and who is or was told.
 _listeners: list[Callable[[str], object]] = []
+_telling: list[Callable[[str], object]] = []
 COMPILED_ONCE = "compile the solvers for this processor: done once, it may take a minute or two"
 
 
 @contextmanager
 def compilation_told(callback: Callable[[str], object]) -> Iterator[None]:
-    """Tell a callback, once, where functions have to be compiled that a user waits for."""
+    """Tell a callback, once, where functions have to be compiled that a user waits for. Within
+    another one that tells, nothing is told again."""
+    if _telling:
+        yield
+        return
+    _telling.append(callback)
     _listeners.append(callback)
     try:
         yield
     finally:
+        _telling.clear()
         with suppress(ValueError):
             _listeners.remove(callback)
 

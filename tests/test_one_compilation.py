@@ -120,6 +120,17 @@ def test_what_is_on_disk_is_not_waited_for_and_waiting_is_told(cache, monkeypatc
     assert (len(asked), told) == (2, [compiled.COMPILED_ONCE])
 
 
+def test_what_was_told_is_not_told_again_within(cache):
+    outer, inner, later = [], [], []
+    with compiled.compilation_told(outer.append):
+        compiled._tell()
+        with compiled.compilation_told(inner.append):
+            compiled._tell()
+    with compiled.compilation_told(later.append):
+        compiled._tell()
+    assert (outer, inner, later) == ([compiled.COMPILED_ONCE], [], [compiled.COMPILED_ONCE])
+
+
 @pytest.mark.skipif(not hasattr(_scaled_tail, "signatures"), reason="nothing is compiled")
 def test_a_function_that_was_compiled_is_held_for_its_types_alone():
     assert _scaled_tail(1.0) == pytest.approx(erfcx(1.0), rel=1e-14)
