@@ -103,6 +103,17 @@ def test_what_only_noise_of_the_input_leaves_is_no_missing_effect(kind):
     assert "noise of measured inputs" in found.reason
 
 
+def test_what_noise_does_is_kept_for_the_last_fit_alone():
+    first, second = (fitted("lag", seed) for seed in (0, 1))
+    known = NoiseOfEstimates.of(first)
+    assert NoiseOfEstimates.of(first) is known
+    other = NoiseOfEstimates.of(second)
+    assert not np.array_equal(other.covariance, known.covariance)
+    again = NoiseOfEstimates.of(first)
+    assert again is not known
+    np.testing.assert_array_equal(again.covariance, known.covariance)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "change"),

@@ -64,6 +64,24 @@ def test_batch_split_and_threads_change_nothing(predictor, vectors, whole, size,
     np.testing.assert_array_equal(np.concatenate([status for _, status in parts]), whole[1])
 
 
+@pytest.mark.parametrize("jobs", [1, 2, 64])
+def test_a_vector_without_a_solution_of_one_run_is_not_solved_in_those_after_it(predictor, jobs):
+    other, asked = copy.copy(predictor), []
+    other.jobs = jobs
+    failing = {(1, 5): Status.SINGULAR, (3, 5): Status.NOT_FINITE, (0, 7): Status.INADMISSIBLE}
+
+    def solve(r, lanes):
+        asked.append((r, lanes))
+        return np.array([failing.get((r, int(lane)), Status.CONVERGED) for lane in lanes])
+
+    status = other.by_blocks(11, 4, solve)
+    wanted = {5: Status.SINGULAR, 7: Status.INADMISSIBLE}
+    assert status.tolist() == [int(wanted.get(lane, 0)) for lane in range(11)]
+    assert max(lanes.size for _, lanes in asked) <= 4
+    runs = {lane: {r for r, lanes in asked if lane in lanes} for lane in (4, 5, 7)}
+    assert runs == {4: set(range(len(other.runs))), 5: {0, 1}, 7: {0}}
+
+
 def test_row_position_changes_nothing(predictor, vectors, whole):
     order = np.random.default_rng(8).permutation(37)
     squares, status = predictor.sum_of_squares(vectors[order])

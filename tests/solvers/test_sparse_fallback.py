@@ -1,18 +1,22 @@
 """Where a sweep through the period loses its digits, a factorisation of all of it answers."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from periodic_problems import coupled, duffing, harmonics, problem, rest
 
 from bayesoleo.model import Model, Parameter
-from bayesoleo.solvers import _elimination as sparse
+from bayesoleo.solvers import _elimination as sparse, _periodic as periodic
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import (
     Solution,
     sensitivities,
+    solve_extrapolated,
     solve_from_guess,
     solve_periodic,
 )
+from bayesoleo.solvers._periodic_newton import NEEDS_EXCHANGE
 
 FORCE = harmonics(h0=0.1, h1=0.8, h2=0.2 - 0.1j)
 
@@ -123,3 +127,37 @@ def test_rows_in_small_units_are_no_singularity():
     np.testing.assert_allclose(sparse.solve(matrix, np.array([[3e-20], [0.0]])), [[1.0], [1.0]])
     assert sparse.solve(sparse.csc_array(np.ones((2, 2))), np.ones((2, 1))) is None
     assert sparse.solve(sparse.csc_array(np.full((1, 1), np.nan)), np.ones((1, 1))) is None
+
+
+@pytest.mark.parametrize("extrapolated", [False, True])
+@pytest.mark.parametrize("exchange", [False, True])
+def test_rows_are_exchanged_only_where_that_is_wanted(monkeypatch, exchange, extrapolated):
+    """Of two lanes the second one needs it; the first has its answer either way."""
+    lanes, x, again = 2, np.zeros((2, 4, 1)), []
+
+    def swept(*_):
+        status = np.array([Status.CONVERGED.value, NEEDS_EXCHANGE])
+        return Solution(x.copy(), status, np.full(lanes, 5))
+
+    class General:
+        def __init__(self, _, p, start, *__):
+            again.append((p.tolist(), start.tolist()))
+
+        def run(self):
+            return Solution(np.ones((1, 4, 1)), np.array([Status.CONVERGED]), np.array([9]))
+
+    monkeypatch.setattr(periodic, "_compiled", swept)
+    monkeypatch.setattr(periodic, "_Newton", General)
+    stub = SimpleNamespace(arranged=SimpleNamespace(layout=None))
+    p, most = np.array([[1.0], [2.0]]), {"max_iterations": 3, "exchange": exchange}
+    if extrapolated:
+        start = SimpleNamespace(
+            x=x[0], moving=np.array([0]), swept=lambda _: (x, x), starts=lambda change: 7.0 * change
+        )
+        found = solve_extrapolated(stub, p, start, np.array([[1.0], [2.0]]), **most)
+    else:
+        found = solve_periodic(stub, p, x, **most)
+    assert found.status[0] == Status.CONVERGED
+    assert found.status[1] == (Status.CONVERGED if exchange else Status.NO_CONVERGENCE)
+    assert again == ([([[2.0]], [[14.0]] if extrapolated else x[1:].tolist())] if exchange else [])
+    assert found.iterations.tolist() == [5, 9 if exchange else 5]
