@@ -10,17 +10,13 @@ loop over points into vector instructions.
 from __future__ import annotations
 
 import ctypes
-import errno
 import pickle
-import sys
-import time
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cached_property, lru_cache, wraps
 from math import prod
 from pathlib import Path
-from typing import IO, Any, Protocol, cast
+from typing import Any, Protocol, cast
 
 import numba
 import numpy as np
@@ -31,14 +27,8 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
 
-from bayesoleo._cache_folder import user_cache
-from bayesoleo._machine_code import (
-    COMPILING,
-    address_of,
-    sealed,
-    unsealed,
-    write_durably,
-)
+from bayesoleo._machine_code import COMPILING, address_of, sealed, unsealed, write_durably
+from bayesoleo._one_compilation import in_one_process
 from bayesoleo._types import Array, Integers
 
 #: Their annotations lack too much for them to be called in checked code.
@@ -80,7 +70,7 @@ class _CheckedFile(_CacheFile):  # type: ignore[misc]
 #: Told once that something is compiled, and who is or was told.
 _listeners: list[Callable[[str], object]] = []
 _telling: list[Callable[[str], object]] = []
-COMPILED_ONCE = "compile the solvers for this processor: done once, it may take a minute or two"
+COMPILED_ONCE = "compile the solvers for this processor: done once, it may take half a minute"
 
 
 @contextmanager
@@ -144,13 +134,9 @@ class _CheckedCache(_FunctionCache):  # type: ignore[misc]
             super()._save_overload(signature, data)
 
 
-#: Level of LLVM's optimisation. At the usual one, three, the same functions take two fifths longer
-#: to compile and are no faster: their loops over points are in kernels, which are compiled apart.
+#: Level of LLVM's optimisation. At the usual one, three, the same functions take longer to compile
+#: and are no faster: their loops over points are in kernels, which are compiled apart.
 LEVEL = 1
-
-
-#: Seconds that a process waits for another one that compiles the same function, and between looks.
-PATIENCE, LOOK = 120.0, 0.02
 #: Functions that this process is compiling; those within others are not waited for.
 _compiling: list[str] = []
 
@@ -164,7 +150,8 @@ def _compiler_of(dispatcher: Any) -> Callable[[Any], Any]:
         # Numba reads the level while it compiles, which it does under this lock.
         with global_compiler_lock, ExitStack() as stack:
             if not _compiling and not dispatcher._cache.holds(signature, dispatcher.targetctx):
-                stack.enter_context(_in_one_process(f"{function.__module__}.{function.__name__}"))
+                name = f"{function.__module__}.{function.__name__}"
+                stack.enter_context(in_one_process(name, _tell))
             before = _config.OPT
             _config.OPT = type(before)(min(before, LEVEL))
             _compiling.append(function.__name__)
@@ -175,57 +162,6 @@ def _compiler_of(dispatcher: Any) -> Callable[[Any], Any]:
                 _config.OPT = before
 
     return compiled
-
-
-@contextmanager
-def _in_one_process(name: str) -> Iterator[None]:
-    """Wait while another process compiles a function; it is on disk then."""
-    file = _lock_of(name)
-    try:
-        yield
-    finally:
-        if file is not None:  # the lock ends with it
-            file.close()
-
-
-def _lock_of(name: str) -> IO[bytes] | None:
-    """A file that is locked for a function, unless another process holds it for too long.
-
-    None on a disk that has no locks: two processes may then compile the same.
-    """
-    with suppress(OSError):
-        folder = user_cache()
-        folder.mkdir(parents=True, exist_ok=True)
-        file = (folder / "compiling.lock").open("ab")
-        end = time.monotonic() + PATIENCE
-        try:
-            while not _locked(file, zlib.crc32(name.encode()) >> 2) and time.monotonic() < end:
-                _tell()
-                time.sleep(LOOK)
-        except BaseException:
-            file.close()
-            raise
-        return file
-    return None
-
-
-def _locked(file: IO[bytes], byte: int) -> bool:
-    """Whether one byte of a file, which need not be there, is locked now for this process."""
-    try:
-        if sys.platform == "win32":
-            import msvcrt
-
-            file.seek(byte)
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-        else:
-            import fcntl
-
-            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, byte)
-    except OSError as error:
-        if error.errno in (errno.EACCES, errno.EAGAIN):
-            return False
-        raise
-    return True
 
 
 def cached[F: Callable[..., Any]](**options: Any) -> Callable[[F], F]:

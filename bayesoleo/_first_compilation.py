@@ -27,12 +27,15 @@ _begun: list[bool] = []
 def begin_early(jobs: int | None) -> bool:
     """Begin with what has to be compiled, unless the mark says that nothing has.
 
-    Returns whether another process compiles.
-
     Parameters
     ----------
     jobs : int, optional
         How many may work at once; alone nothing is begun.
+
+    Returns
+    -------
+    bool
+        Whether another process compiles.
     """
     return not is_marked() and begin(jobs)
 

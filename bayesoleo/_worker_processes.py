@@ -391,7 +391,7 @@ class Beside[S, R]:
     process is ended: nobody waits for what it does.
     """
 
-    #: Processes up to which one long call and the work of this one take them all.
+    #: Jobs beyond which it is not begun: all of them do this call sooner than one process does.
     MOST = 3
 
     def __init__(self, function: Callable[[S], R], message: bytes) -> None:
@@ -432,6 +432,7 @@ class Beside[S, R]:
             worker = _worker(0)
             worker.ask(_sent((_called, self._function, None)))
             self._found.append(worker.ask(self._message))
+            self._message = b""
             worker.ask(_dumps((None, None, None)))  # it needs no memory until the next call
         except _LostError:
             _forget(0)

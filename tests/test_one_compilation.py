@@ -11,13 +11,13 @@ import time
 import pytest
 from scipy.special import erfcx
 
-from bayesoleo import _compiled as compiled
+from bayesoleo import _compiled as compiled, _one_compilation as one
 from bayesoleo.discovery._structure_moments import _scaled_tail
 
 HOLD = """
 import sys, time
-from bayesoleo._compiled import _in_one_process
-with _in_one_process(sys.argv[1]):
+from bayesoleo._one_compilation import in_one_process
+with in_one_process(sys.argv[1], str):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -42,7 +42,7 @@ def holder(cache):
 def entered(name: str) -> float:
     """Seconds until a function may be compiled here."""
     begin = time.monotonic()
-    with compiled._in_one_process(name):
+    with one.in_one_process(name, str):
         return time.monotonic() - begin
 
 
@@ -60,12 +60,12 @@ def test_one_waits_until_the_other_is_done_or_gone(holder, end):
 
 
 def test_another_function_is_not_waited_for(holder):
-    assert entered("g") < 0.5 * compiled.PATIENCE
+    assert entered("g") < 0.5 * one.PATIENCE
     assert holder.poll() is None
 
 
 def test_nobody_waits_for_ever(holder, monkeypatch):
-    monkeypatch.setattr(compiled, "PATIENCE", 0.2)
+    monkeypatch.setattr(one, "PATIENCE", 0.2)
     assert entered("f") >= 0.2
     assert holder.poll() is None
 
@@ -74,14 +74,14 @@ def test_a_disk_without_locks_stops_nothing(cache, monkeypatch):
     def refuses(*_):
         raise OSError(37, "no locks available")
 
-    monkeypatch.setattr(compiled, "_locked", refuses)
-    assert entered("f") < compiled.PATIENCE
+    monkeypatch.setattr(one, "try_lock", refuses)
+    assert entered("f") < one.PATIENCE
 
 
 def test_an_error_within_is_passed_on(cache):
-    with pytest.raises(ZeroDivisionError), compiled._in_one_process("f"):
+    with pytest.raises(ZeroDivisionError), one.in_one_process("f", str):
         raise ZeroDivisionError
-    with pytest.raises(FileNotFoundError), compiled._in_one_process("f"):
+    with pytest.raises(FileNotFoundError), one.in_one_process("f", str):
         raise FileNotFoundError(os.fspath(cache))  # not taken for a disk without locks
 
 
@@ -112,7 +112,7 @@ def test_the_level_of_optimisation_is_given_back(cache):
 
 def test_what_is_on_disk_is_not_waited_for_and_waiting_is_told(cache, monkeypatch):
     asked, told = [], []
-    monkeypatch.setattr(compiled, "_locked", lambda *_: asked.append(1) or len(asked) > 1)
+    monkeypatch.setattr(one, "try_lock", lambda *_: asked.append(1) or len(asked) > 1)
     with compiled.compilation_told(told.append):
         compiled._compiler_of(Dispatcher(lambda _: None, known=True))(None)
         assert (asked, told) == ([], [])

@@ -266,7 +266,6 @@ def demo(
     from bayesoleo._workflow.simulating import demo_campaign
     from bayesoleo.discovery._compile_ahead import begin_compiling, compile_meanwhile
 
-    shell.check_writable(out)
     begin_compiling(chosen.jobs)
     chosen = replace(chosen, quick=not full)
     with shell.stoppable(out, quiet) as told, compilation_told(told["callback"]):

@@ -364,6 +364,8 @@ def begin(command: str, given: Mapping[str, Any], *, search: bool) -> None:
     campaign = given.get("campaign")
     if isinstance(campaign, Path) and not campaign.expanduser().exists():
         return  # an error is told in one line
+    if isinstance(out := given.get("out"), Path):
+        check_writable(out)
     if not given.get("quiet"):
         of = f" {campaign}" if campaign is not None else ""
         complain(f"{command}{of}: loading libraries")

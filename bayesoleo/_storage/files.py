@@ -7,14 +7,12 @@ files are written to a hidden folder; renaming that folder decides that they are
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import os
 import platform
 import re
 import shutil
-import sys
 import tempfile
 import uuid
 from collections.abc import Iterable, Iterator, Sequence
@@ -23,6 +21,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import IO
 
+from bayesoleo._file_locks import try_lock
 from bayesoleo.errors import InputError, ResultsError
 
 
@@ -136,8 +135,6 @@ def remove(path: Path) -> None:
 
 
 LOCK = ".lock"
-#: Windows keeps others from reading the bytes that are locked, so one far behind the text is.
-_LOCKED_BYTE = 1 << 30
 
 
 SUMS = "SHA256SUMS"
@@ -323,7 +320,7 @@ def only_writer(folder: str | os.PathLike[str] | None) -> Iterator[None]:
 def check_free(folder: str | os.PathLike[str]) -> None:
     """Raise a ResultsError if another process writes to a folder; nothing is made."""
     with suppress(OSError), (Path(folder) / LOCK).open("r+b") as file:
-        if not _lock(file):
+        if not try_lock(file):
             raise _busy(Path(folder), file)
 
 
@@ -333,7 +330,7 @@ def _locked_file(place: Path) -> IO[bytes]:
         place.mkdir(parents=True, exist_ok=True)
         while True:
             file = (place / LOCK).open("a+b")
-            if not _lock(file):
+            if not try_lock(file):
                 with file:
                     raise _busy(place, file)
             # Whoever held it before may have removed the file between these two steps.
@@ -371,25 +368,6 @@ def _busy(place: Path, file: IO[bytes]) -> ResultsError:
         file=place,
         hint="wait for it, or give another folder",
     )
-
-
-def _lock(file: IO[bytes]) -> bool:
-    """Lock a file; False where another holds it."""
-    try:
-        if sys.platform == "win32":
-            import msvcrt
-
-            file.seek(_LOCKED_BYTE)
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-        else:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno in (errno.EWOULDBLOCK, errno.EACCES, errno.EAGAIN, errno.EDEADLK):
-            return False
-        raise  # a disk that has no locks: two writers would not see each other
-    return True
 
 
 _TRIAL = ".bayesoleo-"

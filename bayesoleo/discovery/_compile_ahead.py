@@ -41,7 +41,7 @@ def compile_meanwhile(jobs: int | None) -> None:
 
 
 def _is_done() -> bool:
-    """Whether what the other process compiles first and last is there."""
+    """Whether the last of what the other process compiles is there."""
     return is_compiled(beside) and is_compiled(close_and_sweep)
 
 

@@ -358,7 +358,7 @@ def singles(
     """
     size = own.shape[1] + 1
     moments, every, whole = np.empty((len(counts), 3)), np.empty(size), np.empty((size, size))
-    variance, scaled, total = np.empty(size - 1), np.empty(size - 1), freedom + count
+    variance, falls, total = np.empty(size - 1), np.empty(size - 1), freedom + count
     for p in range(len(square)):
         top, before, around = best[min(p, 1)], own[p], spread[p]
         for i in range(size - 1):
@@ -366,12 +366,12 @@ def singles(
         for s in range(slope.shape[1]):
             lost, label = gain[p, s], labels[s]
             for i in range(size - 1):
-                scaled[i] = lost[i, 0]
+                falls[i] = lost[i, 0]
             data = slope[p, s], gram[p, s], square[p], log_det[p], float(count), freedom
             first = 0
             for t in range(len(power)):
                 found[p, s, t] = _height_of_single(
-                    data[:4], total, freedom, power[t], counts, before, variance, scaled
+                    data[:4], total, freedom, power[t], counts, before, variance, falls
                 )
                 if found[p, s, t] > found[p, s, first]:
                     first = t

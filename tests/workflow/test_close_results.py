@@ -14,6 +14,7 @@ from small_campaigns import DAMPER_RUNS, FRICTION, damper, damper_campaign
 
 from bayesoleo import _schema as schema, _workflow as workflow
 from bayesoleo._storage.result_files import read_tree
+from bayesoleo._workflow import closing, structures_beside
 from bayesoleo._workflow.predicting import predict
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.assessment import assess
@@ -208,9 +209,20 @@ def test_a_second_close_takes_up_the_checkpoints_and_agrees(closed, campaign):
     assert {path: after[path] for path in draws} == {path: before[path] for path in draws}
 
 
-def test_results_depend_neither_on_threads_nor_on_the_folder(closed, campaign):
+def test_results_depend_neither_on_threads_nor_on_the_folder(closed, campaign, monkeypatch):
+    """With two jobs structures are compared in another process, with one before the draws."""
+    monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
+    rightly, begun = structures_beside.begun_beside, []
+
+    def noted(*given):
+        begun.append(rightly(*given))
+        return begun[-1]
+
+    monkeypatch.setattr(closing, "begun_beside", noted)
     tree, _ = closed
     other = workflow.close(campaign, MODEL, replace(SETTINGS, jobs=2))
+    assert len(begun) == 1
+    assert begun[0] is not None
     xr.testing.assert_equal(posterior(other), posterior(tree))
     one, two = (json.loads(item.attrs[schema.SUMMARY]) for item in (tree, other))
     for summary in (one, two):
