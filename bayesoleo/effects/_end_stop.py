@@ -28,15 +28,10 @@ from bayesoleo.effects._places import (
     substitute,
 )
 from bayesoleo.model._drive_and_start import MAXIMUM_DERIVATIVE
-from bayesoleo.model._expressions import (
-    derivative_symbol,
-    partial,
-    split_derivative,
-    symbol,
-    within,
-)
+from bayesoleo.model._expressions import derivative_symbol, split_derivative, symbol, within
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Coordinate
+from bayesoleo.model._partial_derivatives import partial
 
 _DEPTH = ShapeParameter(
     "depth",

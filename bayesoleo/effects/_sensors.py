@@ -33,7 +33,6 @@ from bayesoleo.model._expressions import (
     TIME,
     WITHIN,
     derivative_symbol,
-    partial,
     split_derivative,
     symbol,
     total_derivative,
@@ -41,6 +40,7 @@ from bayesoleo.model._expressions import (
 )
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Dof
+from bayesoleo.model._partial_derivatives import partial
 
 
 def _shared(model: Model) -> Sequence[str]:

@@ -17,9 +17,10 @@ from dataclasses import dataclass, replace
 import sympy as sp
 
 from bayesoleo.errors import ModelError
-from bayesoleo.model._expressions import TIME, derivative_symbol, partial, split_derivative, symbol
+from bayesoleo.model._expressions import TIME, derivative_symbol, split_derivative, symbol
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Condition
+from bayesoleo.model._partial_derivatives import partial, symbols_of
 
 _SWITCHES = (sp.Abs, sp.sign, sp.Heaviside, sp.Min, sp.Max)
 
@@ -98,7 +99,7 @@ def derive(model: Model, active: Sequence[str] | None = None) -> Derived:
         for dof, order in zip(model.dofs, orders, strict=True)
         for k in range(order + 1)
     )
-    occurring = {item for e in (*residual, *output, *admissible) for item in e.free_symbols}
+    occurring = frozenset().union(*map(symbols_of, (*residual, *output, *admissible)))
     rows = sorted(
         split_derivative(item) for item in occurring if split_derivative(item)[0] in model.inputs
     )

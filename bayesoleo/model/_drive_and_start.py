@@ -29,17 +29,11 @@ import sympy as sp
 
 from bayesoleo.errors import ModelError
 from bayesoleo.model._derivatives import derive
-from bayesoleo.model._expressions import (
-    TIME,
-    derivative_symbol,
-    parse,
-    partial,
-    split_derivative,
-    symbol,
-)
+from bayesoleo.model._expressions import TIME, derivative_symbol, parse, split_derivative, symbol
 from bayesoleo.model._kernels import Structured
 from bayesoleo.model._model import Model
 from bayesoleo.model._parameters import Dof, Output, Parameter
+from bayesoleo.model._partial_derivatives import partial
 
 #: An input has exact derivatives of any order; equations need at most this many.
 MAXIMUM_DERIVATIVE = 6

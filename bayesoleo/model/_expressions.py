@@ -18,6 +18,7 @@ import sympy as sp
 from sympy.printing.str import StrPrinter
 
 from bayesoleo.errors import ModelError, choose
+from bayesoleo.model._partial_derivatives import partial, symbols_of
 
 #: Seconds since the first sample; for outputs and for transients, a periodic state cannot depend
 #: on it.
@@ -135,72 +136,25 @@ def total_derivative(expression: sp.Expr, dynamic: Iterable[str]) -> sp.Expr:
     """Time derivative along a trajectory, by the chain rule over the names that vary in time."""
     varying = set(dynamic)
     result = sp.Integer(0)
-    for item in expression.free_symbols:
+    for item in symbols_of(expression):
         name, order = split_derivative(item)
         if name in varying:
             result += partial(expression, item) * derivative_symbol(name, order + 1)
     return result
 
 
-def without_impulses(expression: sp.Expr) -> sp.Expr:
-    """Drop the Dirac impulses that differentiating a kink leaves: they act for no time at all."""
-    return expression.replace(sp.DiracDelta, lambda *_: sp.Integer(0))
-
-
-class _RealModulus(sp.Function):  # type: ignore[misc] # SymPy has no types
-    """Modulus of what is real, whatever SymPy knows of it."""
-
-    def fdiff(self, argindex: int = 1) -> sp.Expr:
-        return _RealSign(self.args[0])
-
-
-class _RealSign(sp.Function):  # type: ignore[misc] # SymPy has no types
-    """Sign of what is real, its impulse dropped."""
-
-    def fdiff(self, argindex: int = 1) -> sp.Expr:
-        return sp.Integer(0)
-
-
-def partial(expression: sp.Expr, item: sp.Symbol) -> sp.Expr:
-    """Partial derivative with impulses dropped.
-
-    Models of a search share most of their terms: derivatives of terms are kept.
-    """
-    if not isinstance(expression, sp.Add):
-        return _partial_of_term(expression, item)
-    return sp.Add(*(_partial_of_term(term, item) for term in expression.args))
+def with_symbol_as(expression: sp.Expr, item: sp.Symbol, body: sp.Expr) -> sp.Expr:
+    """The expression with one symbol replaced. What was made of a term is kept."""
+    if item not in symbols_of(expression):
+        return expression
+    if expression.is_Add:
+        return sp.Add(*(_with_symbol(term, item, body) for term in expression.args))
+    return _with_symbol(expression, item, body)
 
 
 @lru_cache(maxsize=20_000)
-def _partial_of_term(expression: sp.Expr, item: sp.Symbol) -> sp.Expr:
-    if item not in expression.free_symbols:
-        return sp.Integer(0)
-    real = _known_to_be_real(expression)
-    slope = sp.diff(real, item)
-    if slope.has(sp.DiracDelta):
-        slope = without_impulses(slope)
-    return slope if real is expression else _exchanged(slope, _MODULUS_AND_SIGN)
-
-
-@lru_cache(maxsize=5_000)
-def _known_to_be_real(expression: sp.Expr) -> sp.Expr:
-    """The expression, with functions that SymPy takes for real where it doubts an argument.
-
-    A quotient may be infinite, and SymPy then takes it for complex: its derivatives of a modulus
-    are real and imaginary parts, that of a sign is left undone.
-    """
-    kinks = expression.atoms(sp.Abs, sp.sign)
-    if all(kink.args[0].is_extended_real for kink in kinks):
-        return expression
-    return _exchanged(expression, {sp.Abs: _RealModulus, sp.sign: _RealSign})
-
-
-_MODULUS_AND_SIGN: Mapping[type, type] = {_RealModulus: sp.Abs, _RealSign: sp.sign}
-
-
-def _exchanged(expression: sp.Expr, functions: Mapping[type, type]) -> sp.Expr:
-    """The expression with functions replaced by others."""
-    return _rebuilt(expression, {}, functions)
+def _with_symbol(expression: sp.Expr, item: sp.Symbol, body: sp.Expr) -> sp.Expr:
+    return expression.xreplace({item: body})
 
 
 def with_symbols_as(expression: sp.Expr, table: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
@@ -213,13 +167,11 @@ def with_symbols_as(expression: sp.Expr, table: Mapping[sp.Symbol, sp.Expr]) -> 
 
 @lru_cache(maxsize=2_000)
 def _with_symbols(expression: sp.Expr, items: frozenset[tuple[sp.Symbol, sp.Expr]]) -> sp.Expr:
-    return _rebuilt(expression, dict(items), {})
+    return _rebuilt(expression, dict(items))
 
 
-def _rebuilt(
-    expression: sp.Expr, table: Mapping[sp.Symbol, sp.Expr], functions: Mapping[type, type]
-) -> sp.Expr:
-    """The expression with symbols and functions replaced.
+def _rebuilt(expression: sp.Expr, table: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
+    """The expression with symbols replaced.
 
     The arguments of a maximum stay as different as they are: to compare them anew takes most of the
     time that SymPy's own replacement does.
@@ -231,10 +183,9 @@ def _rebuilt(
             return table.get(part, part)
         if part not in done:
             arguments = [made(argument) for argument in part.args]
-            kind = functions.get(part.func, part.func)
-            same = kind is part.func and all(map(operator.is_, arguments, part.args))
+            same = all(map(operator.is_, arguments, part.args))
             plain = {"evaluate": False} if isinstance(part, sp.Max | sp.Min) else {}
-            done[part] = part if same else kind(*arguments, **plain)
+            done[part] = part if same else part.func(*arguments, **plain)
         return done[part]
 
     return cast(sp.Expr, made(expression))

@@ -21,8 +21,15 @@ import sympy as sp
 from bayesoleo._schema import reserved
 from bayesoleo._units import Unit, in_si, parse_unit
 from bayesoleo.errors import InputError, ModelError
-from bayesoleo.model._expressions import derivative_symbol, parse, split_derivative, symbol
+from bayesoleo.model._expressions import (
+    derivative_symbol,
+    parse,
+    split_derivative,
+    symbol,
+    with_symbol_as,
+)
 from bayesoleo.model._parameters import Condition, Coordinate, Dof, Output, Parameter, check_start
+from bayesoleo.model._partial_derivatives import symbols_of
 from bayesoleo.model._velocity_dofs import Declared, VelocityDofs, velocity_dofs
 
 type Text = str | float | sp.Expr
@@ -248,9 +255,8 @@ class Model:
         # One pass is enough for names declared in order; an effect may refer to a later one.
         for _ in range(len(table)):
             for item in reversed(table):
-                if expression.has(item):
-                    expression = expression.xreplace({item: table[item]})
-            if not expression.free_symbols & set(table):
+                expression = with_symbol_as(expression, item, table[item])
+            if symbols_of(expression).isdisjoint(table):
                 break
         return expression
 
@@ -289,7 +295,7 @@ class Model:
         everything = [self.equation(name) for name in self.dofs]
         everything += [self.output(name) for name in self.outputs]
         found: dict[str, int] = {}
-        for item in {item for expression in everything for item in expression.free_symbols}:
+        for item in frozenset().union(*map(symbols_of, everything)):
             name, order = split_derivative(item)
             found[name] = max(1, order, found.get(name, 1))
         return found

@@ -10,12 +10,12 @@ from bayesoleo.errors import ModelError
 from bayesoleo.model._expressions import (
     derivative_symbol,
     parse,
-    partial,
     split_derivative,
     symbol,
     total_derivative,
     with_symbols_as,
 )
+from bayesoleo.model._partial_derivatives import partial
 
 KNOWN = {name: symbol(name) for name in ("q", "stiffness", "force")}
 
