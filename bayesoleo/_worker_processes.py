@@ -394,15 +394,23 @@ class Beside[S, R]:
     #: Jobs beyond which it is not begun: all of them do this call sooner than one process does.
     MOST = 3
 
-    def __init__(self, function: Callable[[S], R], message: bytes) -> None:
-        self._function, self._message = function, message
+    def __init__(
+        self, function: Callable[[S], R], message: bytes, more: Sequence[bytes] = ()
+    ) -> None:
+        self._function, self._message, self._more = function, message, more
         self._found: list[tuple[str, Any]] = []
+        self._items: dict[int, Any] = {}
+        self._answered, self._enough = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._ask, daemon=True)
         self._thread.start()
 
     @classmethod
     def begun(
-        cls, function: Callable[[S], R], argument: S, jobs: int | None = None
+        cls,
+        function: Callable[[S], R],
+        argument: S,
+        jobs: int | None = None,
+        then: tuple[Callable[[Any, Any], Any], Any, Sequence[Any]] | None = None,
     ) -> Beside[S, R] | None:
         """The call, begun; None where this process is alone, has others enough for all, where they
         are in use, or the argument cannot be sent.
@@ -415,12 +423,17 @@ class Beside[S, R]:
             Its only argument.
         jobs : int, optional
             As of :func:`process_map`.
+        then : tuple of (callable, object, sequence), optional
+            Function, what all its calls need, and items of work as of :func:`process_map`, which
+            the process goes on with until :meth:`taken` is called.
         """
         jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
         if not 1 < jobs <= cls.MOST or not _usable() or not _in_use.acquire(blocking=False):
             return None
         try:
-            return cls(function, _sent((0, argument)))
+            more = [] if then is None else [_sent((*then[:2], None))]
+            more += [] if then is None else [_sent((0, item)) for item in then[2]]
+            return cls(function, _sent((0, argument)), more)
         except BaseException as error:
             _in_use.release()
             if isinstance(error, _LostError):
@@ -433,11 +446,22 @@ class Beside[S, R]:
             worker.ask(_sent((_called, self._function, None)))
             self._found.append(worker.ask(self._message))
             self._message = b""
+            self._answered.set()
+            self._go_on(worker)
             worker.ask(_dumps((None, None, None)))  # it needs no memory until the next call
         except _LostError:
             _forget(0)
         finally:
+            self._answered.set()
             _in_use.release()
+
+    def _go_on(self, worker: _Worker) -> None:
+        for number, message in enumerate(self._more):
+            if self._enough.is_set():
+                return
+            kind, value = worker.ask(message)
+            if kind == _VALUE:
+                self._items[number - 1] = value  # the first message says what is to be done
 
     def __enter__(self) -> Self:
         return self
@@ -449,7 +473,9 @@ class Beside[S, R]:
 
     def result(self) -> R:
         """What came of it, or the exception that it raised, when it is done."""
-        self._thread.join()
+        self._answered.wait()
+        if not self._more:
+            self._thread.join()  # the processes are free again
         if not self._found:
             _, argument = _loads(self._message)
             self._found.append((_VALUE, self._function(argument)))
@@ -457,6 +483,13 @@ class Beside[S, R]:
         if kind == _ERROR:
             raise value
         return cast(R, value)
+
+    def taken(self) -> dict[int, Any]:
+        """What came of the items that were done after the call, by number; no more are begun. One
+        that fails is left out: whoever needs it meets the error by itself."""
+        self._enough.set()
+        self._thread.join()
+        return dict(self._items)
 
 
 def _called(function: Callable[[Any], Any], argument: Any) -> Any:

@@ -320,6 +320,48 @@ def test_the_argument_is_taken_as_it_was(eager, monkeypatch, lost):
     assert (pid == os.getpid()) == lost
 
 
+def shifted(shared, item):
+    if item == "wrong":
+        raise ValueError(item)
+    return os.getpid(), shared + item
+
+
+def test_the_process_goes_on_with_other_work_until_that_is_taken(eager):
+    then = shifted, 100, [1, 2, "wrong", 4]
+    beside = processes.Beside.begun(where_and_twice, 21, 2, then)
+    pid, value = beside.result()
+    assert value == 42
+    beside._thread.join()  # until all is done
+    assert beside.taken() == {0: (pid, 101), 1: (pid, 102), 3: (pid, 104)}
+    assert processes.Beside.begun(where_and_twice, 1, 2).result() == (pid, 2)  # it is free again
+
+
+def waits(shared, item):
+    time.sleep(item)
+    return item
+
+
+def test_no_more_of_it_is_begun_once_it_is_taken(eager):
+    beside = processes.Beside.begun(where_and_twice, 1, 2, (waits, None, [0.05, 1.0, *[30.0] * 9]))
+    assert beside.result()[1] == 2
+    while 0 not in beside._items:
+        time.sleep(0.01)
+    found = beside.taken()  # the one that it is at comes too
+    assert found == {0: 0.05, 1: 1.0}
+    assert not processes._in_use.locked()
+
+
+def test_a_process_lost_in_other_work_costs_only_that(eager):
+    beside = processes.Beside.begun(where_and_twice, 1, 2, (waits, None, [0.1, 60.0]))
+    assert beside.result()[1] == 2
+    while 0 not in beside._items:
+        time.sleep(0.01)
+    processes.kill_processes()
+    assert beside.taken() == {0: 0.1}
+    assert beside.result()[1] == 2
+    assert processes.Beside.begun(where_and_twice, 3, 2).result()[1] == 6
+
+
 class Unsendable(int):
     def __reduce__(self):
         raise TypeError("it stays here")

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import itertools
-import json
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import nullcontext
-from functools import partial
-from typing import Any, cast
+from typing import Any
 
-import matplotlib
 import numpy as np
 import xarray as xr
 
 from bayesoleo import _schema as schema
 from bayesoleo._report import sections, sentences, structures, tables
-from bayesoleo._report.sections import encode_formula
+from bayesoleo._report.page_figures import figures_of
 from bayesoleo._report.sentences import begin, in_run, role_shown
 from bayesoleo._report.structures import proposal_lines, proposal_table
 from bayesoleo._report.tables import (
@@ -31,7 +27,6 @@ from bayesoleo._report.tables import (
     words,
 )
 from bayesoleo._storage.files import write_text_atomic
-from bayesoleo._worker_processes import process_map
 from bayesoleo.assessment._residual_breakdown import GROUP, ORDERS, RUN, residual_breakdown
 from bayesoleo.effects._catalogue import called, listed, parameter_called
 from bayesoleo.effects._nonparametric import FAMILY
@@ -307,6 +302,7 @@ def write_report(
     tree: xr.DataTree,
     path: str | os.PathLike[str],
     before: Callable[[], object] = lambda: None,
+    ahead: Callable[[], Mapping[str, list[Any]]] | None = None,
 ) -> list[str]:
     """Write the report of a result as a self-contained HTML page.
 
@@ -318,6 +314,8 @@ def write_report(
         Replaced as a whole or not at all.
     before : callable
         What this process does before it draws, while another one draws.
+    ahead : callable, optional
+        Asked after that for the figures that exist, by kind, as :func:`draw_ahead` drew them.
 
     Returns
     -------
@@ -329,7 +327,7 @@ def write_report(
     ResultsError
         The tree holds no summary, or the place cannot be written to.
     """
-    text, failed = _render(tree, before)
+    text, failed = _render(tree, before, ahead)
     write_text_atomic(path, text)
     return failed
 
@@ -339,7 +337,11 @@ def render_report(tree: xr.DataTree) -> str:
     return _render(tree, lambda: None)[0]
 
 
-def _render(tree: xr.DataTree, before: Callable[[], object]) -> tuple[str, list[str]]:
+def _render(
+    tree: xr.DataTree,
+    before: Callable[[], object],
+    ahead: Callable[[], Mapping[str, list[Any]]] | None = None,
+) -> tuple[str, list[str]]:
     """The page, and the figures that it lacks."""
     import jinja2
 
@@ -352,19 +354,22 @@ def _render(tree: xr.DataTree, before: Callable[[], object]) -> tuple[str, list[
     )
     environment.filters["first_of"] = next
     drawing = sections.Drawing()
-    content = _content(tree, drawing, before)
+    summary = _summary(tree)
+    figures = figures_of(tree, summary, drawing, before, ahead)
+    content = _content(tree, drawing, summary, figures)
     page = environment.get_template("report.html.jinja").render(content)
     return page, drawing.failed
 
 
 def _content(
-    tree: xr.DataTree, drawing: sections.Drawing, before: Callable[[], object]
+    tree: xr.DataTree,
+    drawing: sections.Drawing,
+    summary: dict[str, Any],
+    figures: Mapping[str, list[Any]],
 ) -> dict[str, Any]:
     """What the template fills in."""
-    summary = _summary(tree)
     units = tables.output_units(tree, summary)
     averaged = reading.averaged_word(tree)
-    figures = _figures(tree, summary, drawing, before)
     rounds = list(_rounds(summary, figures))
     proposals = list(_proposals(summary, figures))
     return {
@@ -455,75 +460,3 @@ def _proposals(
             "table": proposal_table(entry, sentences.titles(summary)),
             "figures": figures[f"proposal {number}"],
         }
-
-
-Maker = Callable[[xr.DataTree], list[Any]]
-
-
-def _figures(
-    tree: xr.DataTree,
-    summary: dict[str, Any],
-    drawing: sections.Drawing,
-    before: Callable[[], object],
-) -> dict[str, list[Any]]:
-    """All that is drawn, by its place on the page; in several processes."""
-    makers = _makers(summary)
-    shared = tree, _drawing_settings()
-    found = process_map(_draw, shared, list(makers.values()), before=before)
-    drawing.failed += [text for _, failed in found for text in failed]
-    return {name: drawn for name, (drawn, _) in zip(makers, found, strict=True)}
-
-
-def _makers(summary: dict[str, Any]) -> dict[str, tuple[str, Maker]]:
-    """What is drawn in words, and the function that draws it.
-
-    Processes take them from both ends, so that what takes longest stands there.
-    """
-    makers: dict[str, tuple[str, Maker]] = {
-        "residual": ("the residual", sections.residual_figures),
-        "fit": ("the fit", sections.fit_figures),
-        "where": ("the residual breakdown", sections.breakdown_figure),
-        "structures": ("the probabilities of structures", sections.structures_figure),
-        "error": ("the error of each run", sections.error_figure),
-    }
-    for number, entry in enumerate(summary["rounds"]):
-        ranking = partial(sections.ranking_figure, number=number)
-        makers[f"ranking {number}"] = ("the ranking", ranking)
-        curve = partial(sections.nonparametric_figure, entry=entry)
-        makers[f"curve {number}"] = ("the curve", curve)
-    for number, entry in enumerate(summary.get("proposals", [])):
-        proposal = partial(sections.proposal_figure, entry=entry)
-        makers[f"proposal {number}"] = ("the next run", proposal)
-    return makers | {
-        "trace": ("the sampler's chains", sections.trace_figures),
-        "formulas": ("the equations", _formulas),
-        "response": ("the frequency response", sections.response_figures),
-        "data": ("the data", sections.data_figures),
-        "predictive": ("the posterior's prediction", sections.predictive_figures),
-        "posterior": ("the posterior", sections.posterior_figures),
-    }
-
-
-def _drawing_settings() -> dict[str, Any]:
-    """Matplotlib's settings that the user has changed; the backend draws no figure of a page."""
-    now: Mapping[Any, Any] = matplotlib.rcParams
-    usual: Mapping[Any, Any] = matplotlib.rcParamsDefault
-    return {key: now[key] for key in now if key != "backend" and now[key] != usual.get(key)}
-
-
-def _draw(
-    shared: tuple[xr.DataTree, Mapping[str, Any]], item: tuple[str, Maker]
-) -> tuple[list[Any], list[str]]:
-    """Figures of one kind, and what could not be drawn; also in another process."""
-    (tree, settings), (words, make), drawing = shared, item, sections.Drawing()
-    now: Mapping[Any, Any] = matplotlib.rcParams
-    other = {key: value for key, value in settings.items() if now[key] != value}
-    # Settings are the whole process's: here, where they hold already, none is touched.
-    with matplotlib.rc_context(cast(Any, other)) if other else nullcontext():
-        return drawing.of(words, partial(make, tree)), drawing.failed
-
-
-def _formulas(tree: xr.DataTree) -> list[dict[str, Any]]:
-    """Every formula as a picture, or as it is written where it cannot be drawn."""
-    texts = json.loads(tree.attrs.get(schema.EQUATIONS_LATEX, "[]"))
-    return [{"latex": text, "image": encode_formula(text)} for text in texts]

@@ -25,18 +25,21 @@ from bayesoleo._workflow.output import (
     PROPOSALS_STAGE,
     REPORT_STAGE,
     SEARCH_STAGE,
+    Ahead,
     Drawn,
     Groups,
     ResultFolder,
     Stages,
+    finish,
     reason_of,
     report_what_is_there,
     result_groups,
     result_tree,
+    search_groups,
     write_result,
 )
 from bayesoleo._workflow.settings import Settings
-from bayesoleo._workflow.structures_beside import Answer, Asked, answered, begun_beside
+from bayesoleo._workflow.structures_beside import Answer, Asked, answered, begun_beside, pictures_of
 from bayesoleo._workflow.task import Source, Task, prepare, silent
 from bayesoleo.discovery._compile_ahead import compile_meanwhile
 from bayesoleo.discovery._inference import CATALOGUE
@@ -147,8 +150,13 @@ def close(
         )
         # A search that took long is written with its probabilities before the draws.
         first = not settings.quick or time.monotonic() - begun > WORTH_KEEPING
-        beside = None if first else begun_beside(ask, settings.jobs)
+        known, ahead = dict[str, xr.Dataset](), None
         questions, groups, place = no_questions(), None, output.checkpoints
+        beside = None
+        if not first:
+            known = search_groups(loop, stages)
+            shown = None if output.folder is None else finish(task, known, loop.final.fit)
+            beside = begun_beside(ask, shown, settings.jobs)
         if beside is None:
             loop, questions = with_structures(task, loop, answered(ask, callback), stages)
         if first:
@@ -161,18 +169,21 @@ def close(
                 lambda: None,
             )
             if beside is not None:
-                groups = _groups_of(task, loop, drawn, stages)
+                groups = _groups_of(task, loop, drawn, stages, known)
                 callback("compare structures")
                 loop, questions = with_structures(task, loop, beside.result(), stages)
-        return written(task, loop, drawn, output, stages, questions, groups)
+                ahead = partial(pictures_of, beside)
+        return written(task, loop, drawn, output, stages, questions, groups, ahead)
 
 
-def _groups_of(task: Task, loop: ClosedLoop, drawn: Drawn | None, stages: Stages) -> Groups | None:
+def _groups_of(
+    task: Task, loop: ClosedLoop, drawn: Drawn | None, stages: Stages, known: Groups
+) -> Groups | None:
     """What does not depend on structures; None where that fails, which is told when it is made
     again."""
     failed = len(stages.failed)
     try:
-        return result_groups(task, loop, drawn, stages)
+        return result_groups(task, loop, drawn, stages, known)
     except Exception:
         del stages.failed[failed:]
         return None
@@ -254,10 +265,11 @@ def written(
     stages: Stages,
     questions: Sequence[Question],
     groups: Groups | None = None,
+    ahead: Ahead | None = None,
 ) -> xr.DataTree:
     """The result, written; if nothing failed on the way to it."""
     try:
-        tree = write_result(task, loop, drawn, output, stages, questions, groups)
+        tree = write_result(task, loop, drawn, output, stages, questions, groups, ahead)
     except ResultsError:  # nothing more can be written than was
         raise
     except Exception as error:

@@ -45,6 +45,7 @@ from bayesoleo.discovery._loop import ClosedLoop
 from bayesoleo.discovery._open_questions import Question, proposals_entry, proposals_group
 from bayesoleo.discovery._result_tree import (
     loop_groups,
+    loop_predictive,
     point_group,
     posterior_groups,
     records_tree,
@@ -303,6 +304,7 @@ def reason_of(error: Exception) -> str:
 
 Drawn = tuple[Samples, LogDensity]
 Groups = dict[str, xr.Dataset]
+Ahead = Callable[[], Mapping[str, list[Any]]]
 
 
 def write_result(
@@ -313,6 +315,7 @@ def write_result(
     stages: Stages,
     questions: Sequence[Question] = (),
     groups: Groups | None = None,
+    ahead: Ahead | None = None,
 ) -> xr.DataTree:
     """The tree of a closed loop, with its summary and its report; with a folder, its three files.
 
@@ -330,6 +333,8 @@ def write_result(
         What it left to be told apart, and by which runs that could be done.
     groups : mapping of str to Dataset, optional
         What :func:`result_groups` has made of it, if that was done before.
+    ahead : callable, optional
+        Gives the figures that have been drawn before, by kind.
     """
     tree, summary = result_tree(task, loop, drawn, output, stages, questions, groups)
     if output.folder is None:
@@ -340,7 +345,7 @@ def write_result(
         first = _Files(tree, summary, draft)
         for figure in stages.attempt(
             REPORT_STAGE,
-            lambda: write_report(tree, draft / REPORT, first.write),
+            lambda: write_report(tree, draft / REPORT, first.write, ahead),
             lambda: write_plain_report(
                 {**summary, schema.UNFINISHED: stages.failed}, draft / REPORT
             ),
@@ -395,21 +400,27 @@ def report_what_is_there(output: ResultFolder, stages: Stages) -> xr.DataTree | 
     return tree
 
 
-def result_groups(task: Task, loop: ClosedLoop, drawn: Drawn | None, stages: Stages) -> Groups:
-    """The groups of :func:`write_result` that depend neither on the probabilities of structures nor
-    on what new runs would tell."""
+def search_groups(loop: ClosedLoop, stages: Stages) -> Groups:
+    """The groups of :func:`write_result` that follow from the search alone, without probabilities
+    of structures and new runs."""
+    groups = {schema.POINT: point_group(loop.final.fit)}
+    return groups | stages.attempt(PREDICTIONS_STAGE, lambda: loop_groups(loop), dict)
+
+
+def result_groups(
+    task: Task, loop: ClosedLoop, drawn: Drawn | None, stages: Stages, known: Groups | None = None
+) -> Groups:
+    """The same with those of draws; what is known already is not made again."""
+    groups = search_groups(loop, stages) if known is None else known
+    if drawn is None:
+        return groups
     seed, fit = task.settings.seed, loop.final.fit
-    groups = {schema.POINT: point_group(fit)}
-    groups |= stages.attempt(
-        PREDICTIONS_STAGE,
-        lambda: loop_groups(loop, drawn, seed),
-        lambda: _without_failing(loop, seed),
+    groups = groups | stages.attempt(
+        PREDICTIONS_STAGE, lambda: loop_predictive(loop, drawn, seed), dict
     )
-    if drawn is not None:
-        groups |= stages.attempt(
-            POSTERIOR_STAGE, lambda: _posterior(fit, drawn, seed, groups), dict
-        )
-    return groups
+    return groups | stages.attempt(
+        POSTERIOR_STAGE, lambda: _posterior(fit, drawn, seed, groups), dict
+    )
 
 
 def result_tree(
@@ -449,14 +460,6 @@ def _posterior(
     samples, density = drawn
     found = posterior_groups(fit, samples, seed, density)
     return {**found, schema.COMPARISON: compare({**groups, **found})}
-
-
-def _without_failing(loop: ClosedLoop, seed: int) -> dict[str, xr.Dataset]:
-    """The groups of a loop that do not need its posterior; none if these fail too."""
-    try:
-        return loop_groups(loop, None, seed)
-    except Exception:  # what failed is known already
-        return {}
 
 
 def _drive_unit(task: Task, loop: ClosedLoop) -> str:

@@ -1,12 +1,17 @@
 """Probabilities of structures, and the runs that would tell them apart, computed in another process
-while this one draws from the posterior, which does not depend on them."""
+while this one draws from the posterior, which does not depend on them; then figures of the search.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
+
+import xarray as xr
 
 from bayesoleo._parallel import single_blas_thread
+from bayesoleo._report.page_figures import WITHOUT_DRAWS, draw_ahead, shared_by
 from bayesoleo._types import ProgressCallback
 from bayesoleo._worker_processes import Beside
 from bayesoleo._workflow.output import PROPOSALS_STAGE, SEARCH_STAGE, reason_of
@@ -95,9 +100,28 @@ def answered(asked: Asked, callback: ProgressCallback) -> Answer | None:
     return None if asked.loop.without_structures is None else answer(asked, callback)
 
 
-def begun_beside(asked: Asked, jobs: int | None) -> Beside[Asked, Answer] | None:
+def begun_beside(
+    asked: Asked, shown: xr.DataTree | None, jobs: int | None
+) -> Beside[Asked, Answer] | None:
     """The answer, which another process begins to look for; None where that has to be done here, or
-    nothing is asked. Nobody is told how far the other process has come."""
+    nothing is asked. Nobody is told how far the other process has come.
+
+    Parameters
+    ----------
+    asked : Asked
+    shown : DataTree or None
+        Of the search alone: once the process has the answer it draws figures of this until they are
+        wanted.
+    jobs : int, optional
+        Processes, this one included.
+    """
     if asked.loop.without_structures is None:
         return None
-    return Beside.begun(answer, asked, jobs)
+    then = None if shown is None else (draw_ahead, shared_by(shown), list(WITHOUT_DRAWS))
+    return Beside.begun(answer, asked, jobs, then)
+
+
+def pictures_of(beside: Beside[Asked, Answer]) -> dict[str, list[Any]]:
+    """The figures that it has drawn, by kind."""
+    kinds = list(WITHOUT_DRAWS)
+    return {kinds[k]: drawn for k, drawn in beside.taken().items() if drawn is not None}

@@ -310,10 +310,8 @@ def fitted_groups(fit: ModelFit) -> dict[str, xr.Dataset]:
     }
 
 
-def loop_groups(
-    loop: ClosedLoop, drawn: tuple[Samples, LogDensity] | None, seed: int
-) -> dict[str, xr.Dataset]:
-    """The groups prediction, residual, discovery, nonparametric and period_predictive."""
+def loop_groups(loop: ClosedLoop) -> dict[str, xr.Dataset]:
+    """The groups prediction, residual, discovery and nonparametric."""
     groups = {
         schema.PREDICTION: _predictions(
             [(stage, state.fit, ordered(state)) for stage, state in _stages(loop)]
@@ -324,12 +322,16 @@ def loop_groups(
     shape = shape_group(loop)
     if shape is not None:
         groups[schema.NONPARAMETRIC] = shape
-    if drawn is not None:
-        final, (samples, density) = loop.final, drawn
-        groups[schema.PERIOD_PREDICTIVE] = predictive_group(
-            final.fit, ordered(final), samples, density, seed
-        )
     return groups
+
+
+def loop_predictive(
+    loop: ClosedLoop, drawn: tuple[Samples, LogDensity], seed: int
+) -> dict[str, xr.Dataset]:
+    """The group period_predictive of the final model."""
+    final, (samples, density) = loop.final, drawn
+    found = predictive_group(final.fit, ordered(final), samples, density, seed)
+    return {schema.PERIOD_PREDICTIVE: found}
 
 
 # -- pieces ---------------------------------------------------------------------------

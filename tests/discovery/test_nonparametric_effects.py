@@ -87,7 +87,7 @@ def test_its_shape_is_the_true_one_within_its_band(strange):
 
 
 def test_the_curve_is_kept_and_told(strange):
-    groups = loop_groups(strange, None, 0)
+    groups = loop_groups(strange)
     found = groups[schema.NONPARAMETRIC]
     assert found.attrs["effect"] == "nonparametric_displacement"
     assert found["value"].attrs[schema.UNITS] == "N"

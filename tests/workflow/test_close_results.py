@@ -13,6 +13,8 @@ import xarray as xr
 from small_campaigns import DAMPER_RUNS, FRICTION, damper, damper_campaign
 
 from bayesoleo import _schema as schema, _workflow as workflow
+from bayesoleo._report.page import render_report
+from bayesoleo._report.page_figures import WITHOUT_DRAWS, draw_ahead, shared_by
 from bayesoleo._storage.result_files import read_tree
 from bayesoleo._workflow import closing, structures_beside
 from bayesoleo._workflow.predicting import predict
@@ -228,6 +230,26 @@ def test_results_depend_neither_on_threads_nor_on_the_folder(closed, campaign, m
     for summary in (one, two):
         summary.pop("files")
     assert one == two
+
+
+def test_figures_drawn_ahead_are_those_of_the_result(closed, campaign, tmp_path, monkeypatch):
+    monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
+    rightly, drawn = closing.pictures_of, {}
+
+    def whole(beside):
+        beside._thread.join()  # until it has drawn all
+        drawn.update(rightly(beside))
+        return drawn
+
+    monkeypatch.setattr(closing, "pictures_of", whole)
+    tree = workflow.close(campaign, MODEL, replace(SETTINGS, jobs=2), out=tmp_path)
+    assert drawn.keys() == WITHOUT_DRAWS.keys()
+    assert all(drawn[kind] for kind in ("residual", "data", "fit", "formulas"))
+    shared = shared_by(tree)
+    for kind, figures in drawn.items():
+        assert figures == draw_ahead(shared, kind)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert page == render_report(read_tree(tmp_path / "results.nc"))
 
 
 @pytest.mark.slow

@@ -1,0 +1,123 @@
+"""All figures and formulas of the page by kind, drawn in several processes, some of them ahead.
+
+What shows the data and the search alone can be drawn while the posterior is sampled.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from functools import partial
+from typing import Any, cast
+
+import matplotlib
+import xarray as xr
+
+from bayesoleo import _schema as schema
+from bayesoleo._report import sections
+from bayesoleo._report.sections import encode_formula
+from bayesoleo._worker_processes import process_map
+
+Maker = Callable[[xr.DataTree], list[Any]]
+
+
+def figures_of(
+    tree: xr.DataTree,
+    summary: dict[str, Any],
+    drawing: sections.Drawing,
+    before: Callable[[], object],
+    ahead: Callable[[], Mapping[str, list[Any]]] | None,
+) -> dict[str, list[Any]]:
+    """All that is drawn, by its place on the page; in several processes."""
+    makers, known = _makers(summary), dict[str, list[Any]]()
+    if ahead is not None:
+        before()  # while that goes on
+        known = dict(ahead())
+        makers = {name: maker for name, maker in makers.items() if name not in known}
+    first = before if ahead is None else lambda: None
+    found = process_map(_draw, shared_by(tree), list(makers.values()), before=first)
+    drawing.failed += [text for _, failed in found for text in failed]
+    return known | {name: drawn for name, (drawn, _) in zip(makers, found, strict=True)}
+
+
+def shared_by(tree: xr.DataTree) -> tuple[xr.DataTree, dict[str, Any]]:
+    """What all figures of a tree need, in another process too."""
+    return tree, _drawing_settings()
+
+
+def draw_ahead(shared: tuple[xr.DataTree, Mapping[str, Any]], kind: str) -> list[Any] | None:
+    """Figures of one kind, which need neither draws nor a summary; None where they cannot be
+    drawn.
+
+    Parameters
+    ----------
+    shared : tuple
+        Of :func:`shared_by`.
+    kind : str
+        One of :data:`WITHOUT_DRAWS`.
+    """
+    drawn, failed = _draw(shared, WITHOUT_DRAWS[kind])
+    return None if failed else drawn
+
+
+def _makers(summary: dict[str, Any]) -> dict[str, tuple[str, Maker]]:
+    """What is drawn in words, and the function that draws it.
+
+    Processes take them from both ends, so that what takes longest stands there.
+    """
+    first, last = ("residual", "fit", "where"), ("formulas", "response", "data")
+    makers: dict[str, tuple[str, Maker]] = {name: WITHOUT_DRAWS[name] for name in first} | {
+        "structures": ("the probabilities of structures", sections.structures_figure),
+        "error": ("the error of each run", sections.error_figure),
+    }
+    for number, entry in enumerate(summary["rounds"]):
+        ranking = partial(sections.ranking_figure, number=number)
+        makers[f"ranking {number}"] = ("the ranking", ranking)
+        curve = partial(sections.nonparametric_figure, entry=entry)
+        makers[f"curve {number}"] = ("the curve", curve)
+    for number, entry in enumerate(summary.get("proposals", [])):
+        proposal = partial(sections.proposal_figure, entry=entry)
+        makers[f"proposal {number}"] = ("the next run", proposal)
+    return makers | {
+        "trace": ("the sampler's chains", sections.trace_figures),
+        **{name: WITHOUT_DRAWS[name] for name in last},
+        "predictive": ("the posterior's prediction", sections.predictive_figures),
+        "posterior": ("the posterior", sections.posterior_figures),
+    }
+
+
+def _drawing_settings() -> dict[str, Any]:
+    """Matplotlib's settings that the user has changed; the backend draws no figure of a page."""
+    now: Mapping[Any, Any] = matplotlib.rcParams
+    usual: Mapping[Any, Any] = matplotlib.rcParamsDefault
+    return {key: now[key] for key in now if key != "backend" and now[key] != usual.get(key)}
+
+
+def _draw(
+    shared: tuple[xr.DataTree, Mapping[str, Any]], item: tuple[str, Maker]
+) -> tuple[list[Any], list[str]]:
+    """Figures of one kind, and what could not be drawn; also in another process."""
+    (tree, settings), (words, make), drawing = shared, item, sections.Drawing()
+    now: Mapping[Any, Any] = matplotlib.rcParams
+    other = {key: value for key, value in settings.items() if now[key] != value}
+    # Settings are the whole process's: here, where they hold already, none is touched.
+    with matplotlib.rc_context(cast(Any, other)) if other else nullcontext():
+        return drawing.of(words, partial(make, tree)), drawing.failed
+
+
+def _formulas(tree: xr.DataTree) -> list[dict[str, Any]]:
+    """Every formula as a picture, or as it is written where it cannot be drawn."""
+    texts = json.loads(tree.attrs.get(schema.EQUATIONS_LATEX, "[]"))
+    return [{"latex": text, "image": encode_formula(text)} for text in texts]
+
+
+#: What is drawn, in words, and the function that draws it, of the data and of the search alone.
+WITHOUT_DRAWS: dict[str, tuple[str, Maker]] = {
+    "residual": ("the residual", sections.residual_figures),
+    "data": ("the data", sections.data_figures),
+    "where": ("the residual breakdown", sections.breakdown_figure),
+    "formulas": ("the equations", _formulas),
+    "fit": ("the fit", sections.fit_figures),
+    "response": ("the frequency response", sections.response_figures),
+}
