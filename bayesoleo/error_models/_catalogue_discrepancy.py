@@ -185,8 +185,9 @@ class CatalogueErrors(ErrorModel):
             ]
             for r in range(runs)
         ]
-        scaled = [[white[r][b][0] / found.noise[b] for b in range(outputs)] for r in range(runs)]
-        self._variances, self._rotation = range_of(scaled)
+        # Signatures of all samples take hundreds of megabytes: they are not copied to be scaled.
+        blocks = [[block for block, _ in row] for row in white]
+        self._variances, self._rotation = range_of(blocks, found.noise)
         self._signatures = found.without_columns()
         # Coefficients of each effect that acts alone, at unit size.
         alone = self._rotation[found.single] / np.sqrt(found.share[found.single])[:, None]
@@ -196,8 +197,7 @@ class CatalogueErrors(ErrorModel):
         self._log_odds = np.log(0.5 * found.odds / ALONE)
         self.frame = replace(frame, signatures=self._signatures)
         self._parts = [
-            [self._part(samples[r], b, scaled[r][b], float(white[r][b][1])) for b in range(outputs)]
-            for r in range(runs)
+            [self._part(samples[r], b, *white[r][b]) for b in range(outputs)] for r in range(runs)
         ]
         # Products of signatures beside the smooth functions, of each output and run.
         self._grams = np.array([[self._beside(part) for part in row] for row in self._parts])
@@ -205,19 +205,21 @@ class CatalogueErrors(ErrorModel):
         self._power = np.array([[part.power for part in row] for row in self._parts])
 
     def _part(self, samples: RunSamples, b: int, signatures: Array, log_sd: float) -> Part:
-        """Basis of one output in one run."""
+        """Basis of one output in one run, given its whitened signatures (k, n)."""
         outputs, count = len(self.frame.outputs), self._variances.size
         smooth, _ = whitened(
             smooth_basis(_phase(samples)).T, samples.time, *self._signatures.colour[b]
         )
         left, values, right = np.linalg.svd(smooth.T, full_matrices=False)
         values = np.where(values**2 > _NONE * values[0] ** 2, values, 0.0)
-        effects = (self._rotation.T @ signatures).T
         width = values.size
+        table = np.empty((len(left), width + count))
+        table[:, :width] = left
+        effects = table[:, width:]
+        np.matmul(signatures.T, self._rotation / self._signatures.noise[b], out=effects)
         shared = np.zeros((width, count + outputs * width))
         shared[:, :count] = left.T @ effects
         shared[:, count + b * width : count + (b + 1) * width] = values[:, None] * right
-        table = np.ascontiguousarray(np.hstack([left, effects]))
         scale = log_sd + signatures.shape[1] * float(np.log(self._signatures.noise[b]))
         return Part(table, width, values**2, shared, scale)
 

@@ -387,9 +387,21 @@ class Shared:
         return np.asarray(self.deviation * drawn)
 
 
-def range_of(columns: Sequence[Sequence[Array]]) -> tuple[Array, Array]:
-    """Squared sizes (R,) of the directions that signatures span, and their coefficients (k, R)."""
-    gram = sum(block @ block.T for row in columns for block in row)
+def range_of(columns: Sequence[Sequence[Array]], noise: Array) -> tuple[Array, Array]:
+    """Squared sizes (R,) of the directions that signatures span, and their coefficients (k, R).
+
+    Parameters
+    ----------
+    columns : sequence of sequence of ndarray, each shape (k, n)
+        Signatures in each run and output.
+    noise : ndarray, shape (s,)
+        Standard deviations of the outputs' noise, the unit of sizes.
+    """
+    gram = sum(
+        (block @ block.T) / unit**2
+        for row in columns
+        for block, unit in zip(row, noise, strict=True)
+    )
     values, vectors = np.linalg.eigh(gram)
     kept = values > NEGLIGIBLE
     return values[kept][::-1], np.ascontiguousarray(vectors[:, kept][:, ::-1])
