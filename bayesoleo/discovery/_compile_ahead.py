@@ -3,21 +3,36 @@
 Another process compiles Newton's iteration and the elimination of sensitivities, which is mostly
 the iteration's own, then what is needed later. Meanwhile this one compiles what follows the first
 solution. Each waits where it comes to what the other is compiling.
+
+A search of long runs may have to seek a motion by shooting, once and after minutes: what that needs
+is compiled by a process of low priority while the search goes on.
 """
 
 from __future__ import annotations
 
+import os
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bayesoleo import _first_compilation as first_compilation
 from bayesoleo._compiled import is_compiled
+from bayesoleo._parallel import available_cores, thread_limit
+from bayesoleo._worker_processes import begin_elsewhere
 from bayesoleo.discovery._structure_moments import beside
 from bayesoleo.solvers._elimination import close_and_sweep
+from bayesoleo.solvers._march import is_march_compiled
 
 if TYPE_CHECKING:
     from bayesoleo.prediction._periodic_run import RunPredictor
+    from bayesoleo.prediction._predictor import Predictor
+
+#: Steps of a period from which shooting is prepared for: on fewer a factorisation of the period
+#: brings most iterations to their end.
+MANY_STEPS = 1024
+#: What a process of low priority gives way to.
+NICE = 10
 
 
 def begin_compiling(jobs: int | None) -> None:
@@ -40,6 +55,34 @@ def compile_meanwhile(jobs: int | None) -> None:
         compile_here()
 
 
+def compile_shooting_meanwhile(predictor: Predictor, jobs: int | None) -> None:
+    """Begin to compile in another process what shooting needs, where a run is long and nothing of
+    that is compiled yet.
+
+    Parameters
+    ----------
+    predictor : Predictor
+        Of the runs.
+    jobs : int, optional
+        How many may work at once; alone nothing is begun.
+    """
+    long = any(run.record.periodic and run.steps > MANY_STEPS for run in predictor.runs)
+    alone = min(thread_limit(), jobs or available_cores()) < 2
+    if long and not alone and not is_march_compiled():
+        begin_elsewhere(__name__, compile_shooting.__name__)
+
+
+def compile_shooting() -> None:
+    """Find a motion by shooting, in a process that gives way to others."""
+    from bayesoleo.prediction._starts import solve_from_shot
+
+    with suppress(AttributeError, OSError):  # a system without priorities
+        os.nice(NICE)
+    run = _oscillator()
+    p = _constants(run)[0]
+    solve_from_shot(run.model, run.kernels, run.record, run.boundary, p, run.guess(p))
+
+
 def _is_done() -> bool:
     """Whether the last of what the other process compiles is there."""
     return is_compiled(beside) and is_compiled(close_and_sweep)
@@ -58,7 +101,10 @@ def compile_ahead() -> None:
 
 
 def compile_here() -> None:
-    """Compile what evaluates, samples and compares a motion."""
+    """Compile what evaluates, samples and compares a motion.
+
+    First the elimination of a period, to which the other process comes later.
+    """
     from bayesoleo.solvers._switching import evaluate, periodic_signal
 
     run = _oscillator()

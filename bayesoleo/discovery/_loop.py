@@ -22,6 +22,7 @@ from bayesoleo._parallel import single_blas_thread
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._alternatives import best_of_beam, eliminated
 from bayesoleo.discovery._assembly import Added, Assembly, Roles
+from bayesoleo.discovery._compile_ahead import compile_shooting_meanwhile
 from bayesoleo.discovery._corners import beginning, cornered
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._fit_and_hold_out_error import RunError, least_noise, limit
@@ -495,6 +496,8 @@ def _went_no_further(known: Progress) -> bool:
 
 def searched(known: Progress, search: SearchOptions) -> Progress:
     """Continue a search to its end, with a review of its final effects."""
+    if not (known.finished or known.state.at_floor):
+        compile_shooting_meanwhile(known.state.fit.predictor, search.numerics.jobs)
     for left in reversed(range(search.max_effects + 1)):
         known = _rounds(known, search)
         if _went_no_further(known):

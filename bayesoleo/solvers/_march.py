@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesoleo._compiled import inner, jit
+from bayesoleo._compiled import inner, is_compiled, jit
 from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.solvers._elimination import eliminate
 from bayesoleo.solvers._radau_step import (
@@ -438,6 +438,11 @@ def march(
     path = _room(task, front)
     run: Any = _walk  # mypy takes what Numba returns for a function without arguments
     return path, *run(task, system, front, path, work)
+
+
+def is_march_compiled() -> bool:
+    """Whether the march is on disk: to compile it takes ten seconds and more."""
+    return is_compiled(_walk)
 
 
 def _room(task: MarchTask, front: Front) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -131,3 +132,52 @@ def test_where_no_process_may_be_begun_everything_is_compiled_when_it_is_needed(
     monkeypatch.setattr(ahead, "compile_here", lambda: pytest.fail("nobody compiles the rest"))
     assert not first.begin_early(2)
     ahead.compile_meanwhile(2)
+
+
+@pytest.mark.parametrize(
+    ("steps", "jobs", "compiled", "begun"),
+    [(2048, 2, False, 1), (1024, 2, False, 0), (2048, 1, False, 0), (2048, 2, True, 0)],
+)
+def test_shooting_is_prepared_for_in_long_runs(monkeypatch, steps, jobs, compiled, begun):
+    asked = []
+    oscillator = ahead._oscillator()
+    oscillator.steps = steps
+    monkeypatch.setattr(ahead, "begin_elsewhere", lambda *call: asked.append(call))
+    monkeypatch.setattr(ahead, "thread_limit", lambda: 2)
+    monkeypatch.setattr(ahead, "is_march_compiled", lambda: compiled)
+    ahead.compile_shooting_meanwhile(SimpleNamespace(runs=[oscillator]), jobs)
+    assert len(asked) == begun
+    for module, name in asked:
+        assert callable(getattr(sys.modules[module], name))
+
+
+SHOT = """
+import numpy as np
+from bayesoleo.discovery._compile_ahead import compile_shooting
+from bayesoleo.model import Dof, Model, Output, Parameter
+from bayesoleo.prediction._predictor import Predictor
+from bayesoleo.prediction._simulate import RunPlan, motion, record_of
+from bayesoleo.prediction._starts import solve_from_shot
+
+dofs = {"a": Dof(""), "b": Dof("")}
+terms = {"a": {"all": "ddot(a) + dot(a) + abs(a)*a + k*(a - b) - u"},
+         "b": {"all": "dot(b) + b - a"}}
+model = Model("two", inputs={"u": ""}, dofs=dofs, parameters={"k": Parameter(1.0, sd=0.1)},
+              equations=terms, outputs={"a": Output("a", "")})
+run = Predictor(model, [record_of(model, RunPlan("any", 1.0, {"u": motion(0.0, [1.0])}))]).runs[0]
+p = np.ones(1)
+assert solve_from_shot(model, run.kernels, run.record, run.boundary, p, run.guess(p)).status[0] == 0
+"""
+
+
+@pytest.mark.slow
+def test_a_shot_at_another_model_needs_nothing_that_was_not_compiled_for_it(tmp_path):
+    run("import bayesoleo.discovery._compile_ahead as ahead; ahead.compile_shooting()", tmp_path)
+    marched = {name for name in compiled(tmp_path) if name.startswith(("_march.", "_switching."))}
+    assert any(name.startswith("_march._walk-") for name in marched)
+    index = {file: file.read_bytes() for file in tmp_path.rglob("*.nbi")}
+    run(SHOT, tmp_path)
+    again = {file: file.read_bytes() for file in tmp_path.rglob("*.nbi")}
+    changed = {file.name.split("-")[0] for file in again if again[file] != index.get(file)}
+    # Of two unknowns an iteration has types of its own; the march has not.
+    assert not {name for name in changed if name.startswith(("_march.", "_radau_step."))}
