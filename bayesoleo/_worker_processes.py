@@ -38,7 +38,11 @@ LOOK = 0.05
 #: Seconds without work after which a process ends.
 IDLE = 120.0
 
+#: A message: a pickle, and the memory of its large arrays, which is not copied into it.
+type Message = list[memoryview | bytes | bytearray]
 _HEADER = struct.Struct("<Q")
+#: Bytes from which an array is sent beside the pickle: arrays take a copy less on either side.
+LARGE = 2**16
 #: It finds modules where its parent finds them, and does not run the user's script again.
 _CHILD = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]);"
@@ -194,7 +198,8 @@ class _Call:
         self.found: dict[int, Any] = {}
         self.failed: BaseException | None = None
         self.lock, self.over = threading.Lock(), threading.Event()
-        self.begun, self._sent = time.perf_counter(), b""
+        self.begun = time.perf_counter()
+        self._sent: Message = []
 
     def _take(self, last: bool) -> int | None:
         with self.lock:
@@ -265,7 +270,7 @@ class _Call:
         least = WORTH_ASKING if number in _workers else WORTH_STARTING
         return took > LOOK and each * len(self.left) > least
 
-    def _message(self) -> bytes:
+    def _message(self) -> Message:
         with self.lock:
             if not self._sent:
                 self._sent = _sent((self.function, self.shared, self.known))
@@ -395,7 +400,7 @@ class Beside[S, R]:
     MOST = 3
 
     def __init__(
-        self, function: Callable[[S], R], message: bytes, more: Sequence[bytes] = ()
+        self, function: Callable[[S], R], message: Message, more: Sequence[Message] = ()
     ) -> None:
         self._function, self._message, self._more = function, message, more
         self._found: list[tuple[str, Any]] = []
@@ -431,9 +436,9 @@ class Beside[S, R]:
         if not 1 < jobs <= cls.MOST or not _usable() or not _in_use.acquire(blocking=False):
             return None
         try:
-            more = [] if then is None else [_sent((*then[:2], None))]
-            more += [] if then is None else [_sent((0, item)) for item in then[2]]
-            return cls(function, _sent((0, argument)), more)
+            more = [] if then is None else [(*then[:2], None), *((0, item) for item in then[2])]
+            taken = [_as_it_is(_sent(one)) for one in ((0, argument), *more)]
+            return cls(function, taken[0], taken[1:])
         except BaseException as error:
             _in_use.release()
             if isinstance(error, _LostError):
@@ -445,7 +450,7 @@ class Beside[S, R]:
             worker = _worker(0)
             worker.ask(_sent((_called, self._function, None)))
             self._found.append(worker.ask(self._message))
-            self._message = b""
+            self._message = []
             self._answered.set()
             self._go_on(worker)
             worker.ask(_dumps((None, None, None)))  # it needs no memory until the next call
@@ -515,7 +520,7 @@ class _Worker:
             env=environment,
         )
 
-    def ask(self, message: bytes, known: Sequence[Any] = ()) -> tuple[str, Any]:
+    def ask(self, message: Message, known: Sequence[Any] = ()) -> tuple[str, Any]:
         """Send a message and wait for the answer: its kind and its content."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
@@ -614,7 +619,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 # -- messages -------------------------------------------------------------------------------------
 
 
-def _dumps(value: Any, known: Sequence[Any] = ()) -> bytes:
+def _dumps(value: Any, known: Sequence[Any] = ()) -> Message:
     """A pickle by value of what no module holds; known objects are referred to by number."""
     import cloudpickle
 
@@ -630,9 +635,21 @@ def _dumps(value: Any, known: Sequence[Any] = ()) -> bytes:
                 return _as_it_was, (type(one), one.args)
             return super().reducer_override(one)
 
-    stream = io.BytesIO()
-    Pickler(stream, protocol=pickle.HIGHEST_PROTOCOL).dump(value)
-    return stream.getvalue()
+    stream, large = io.BytesIO(), list[memoryview]()
+
+    def is_small(buffer: pickle.PickleBuffer) -> bool:
+        memory = buffer.raw()
+        if memory.nbytes >= LARGE:
+            large.append(memory)
+        return memory.nbytes < LARGE
+
+    Pickler(stream, protocol=pickle.HIGHEST_PROTOCOL, buffer_callback=is_small).dump(value)
+    return [stream.getvalue(), *large]
+
+
+def _as_it_is(message: Message) -> Message:
+    """A copy of a message, which does not follow what becomes of its arrays."""
+    return [bytes(part) for part in message]
 
 
 def _extremes() -> tuple[Any, ...]:
@@ -647,7 +664,7 @@ def _as_it_was(kind: Any, arguments: tuple[Any, ...]) -> Any:
     return kind(*arguments, evaluate=False)
 
 
-def _sent(value: Any, known: Sequence[Any] = ()) -> bytes:
+def _sent(value: Any, known: Sequence[Any] = ()) -> Message:
     """The same for a process; what cannot be sent is done here."""
     try:
         return _dumps(value, known)
@@ -655,28 +672,52 @@ def _sent(value: Any, known: Sequence[Any] = ()) -> bytes:
         raise _LostError from error
 
 
-def _loads(content: bytes, known: Sequence[Any] = ()) -> Any:
+def _loads(message: Message, known: Sequence[Any] = ()) -> Any:
     class Unpickler(pickle.Unpickler):
         def persistent_load(self, number: Any) -> Any:
             return known[number]
 
-    return Unpickler(io.BytesIO(content)).load()
+    content, *large = message
+    return Unpickler(io.BytesIO(content), buffers=large).load()
 
 
-def _send(pipe: BinaryIO, message: bytes) -> None:
-    pipe.write(_HEADER.pack(len(message)))
-    pipe.write(message)
+def _send(pipe: BinaryIO, message: Message) -> None:
+    sizes = [len(message), *(len(part) for part in message)]
+    pipe.write(b"".join(map(_HEADER.pack, sizes)))
+    for part in message:
+        pipe.write(part)
     pipe.flush()
 
 
-def _receive(pipe: BinaryIO) -> bytes | None:
+def _receive(pipe: BinaryIO) -> Message | None:
     """A message; None at the end of the pipe."""
-    head = pipe.read(_HEADER.size)
-    if len(head) < _HEADER.size:
+    count = _number(pipe)
+    if count is None:
         return None
-    (size,) = _HEADER.unpack(head)
-    content = pipe.read(size)
-    return content if len(content) == size else None
+    sizes = [_number(pipe) for _ in range(count)]
+    parts: Message = []
+    for size in sizes:
+        part = None if size is None else _filled(pipe, size)
+        if part is None:
+            return None
+        parts.append(part)
+    return parts
+
+
+def _number(pipe: BinaryIO) -> int | None:
+    head = pipe.read(_HEADER.size)
+    return _HEADER.unpack(head)[0] if len(head) == _HEADER.size else None
+
+
+def _filled(pipe: BinaryIO, size: int) -> bytearray | None:
+    """So many bytes, which an array may take for its own memory; None where the pipe ends."""
+    part, at = bytearray(size), 0
+    while at < size:
+        got = pipe.readinto(memoryview(part)[at:])  # type: ignore[attr-defined]
+        if not got:
+            return None
+        at += got
+    return part
 
 
 def serve(modules: Sequence[str]) -> None:
@@ -719,7 +760,7 @@ def serve(modules: Sequence[str]) -> None:
         _send(target, answer)
 
 
-def _answer(value: Any, known: Sequence[Any]) -> bytes:
+def _answer(value: Any, known: Sequence[Any]) -> Message:
     """A result for the parent; where it cannot be sent, the parent computes it."""
     try:
         return _dumps((_VALUE, value), known)
@@ -734,7 +775,7 @@ def _waits(source: BinaryIO) -> bool:
     return bool(select.select([source], [], [], IDLE)[0])
 
 
-def _of_error(error: Exception) -> bytes:
+def _of_error(error: Exception) -> Message:
     """An error for the parent; where it cannot be sent, the parent meets it by itself."""
     try:
         content = _dumps((_ERROR, error))

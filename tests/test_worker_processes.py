@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import os
 import signal
 import subprocess
@@ -386,3 +387,45 @@ def test_one_that_nobody_waits_for_is_ended(eager):
         raise KeyboardInterrupt
     assert not processes._in_use.locked()
     assert processes.Beside.begun(where_and_twice, 5, 2).result()[1] == 10
+
+
+@pytest.mark.parametrize("size", [3, 400], ids=["within the pickle", "beside it"])
+def test_arrays_come_as_they_were_and_are_their_owners(eager, size):
+    rng = np.random.default_rng(3)
+    table = rng.standard_normal((size, size + 1))
+    shared = {"table": table.copy(), "strided": np.asfortranarray(table)[::2, ::3]}
+    assert (table.nbytes >= processes.LARGE) == (size > 100)
+    pid, found = processes.Beside.begun(where_and_copied, shared, 2).result()
+    assert pid != os.getpid()
+    found["table"] += 1.0
+    np.testing.assert_array_equal(found["table"], table + 1.0)
+    np.testing.assert_array_equal(found["strided"], shared["strided"])
+    np.testing.assert_array_equal(shared["table"], table)
+
+
+def where_and_copied(value):
+    return os.getpid(), value
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_large_argument_is_taken_as_it_was(eager, monkeypatch, lost):
+    if lost:
+        processes._worker(0).process.kill()
+        monkeypatch.setattr(processes, "_worker", lambda number: processes._workers[number])
+    argument = np.ones(2 * processes.LARGE)
+    beside = processes.Beside.begun(where_and_copied, argument, 2)
+    argument[:] = 7.0
+    assert np.all(beside.result()[1] == 1.0)
+
+
+def test_a_message_cut_short_is_no_message():
+    message = processes._dumps({"large": np.arange(1e5), "small": 3})
+    assert len(message) == 2
+    stream = io.BytesIO()
+    processes._send(stream, message)
+    whole = stream.getvalue()
+    assert len(whole) > 8e5
+    read = processes._loads(processes._receive(io.BytesIO(whole)))
+    np.testing.assert_array_equal(read["large"], np.arange(1e5))
+    for cut in (0, 5, 8, 20, 30, 1000, len(whole) - 1):
+        assert processes._receive(io.BytesIO(whole[:cut])) is None

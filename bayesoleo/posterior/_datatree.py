@@ -43,6 +43,8 @@ from bayesoleo.posterior._log_density import LANES, LOG_VARIANCE, LogDensity
 
 #: Blocks of all runs together, at most, as long as each run has one.
 MOST_BLOCKS = 128
+#: Draws whose residuals are held together, at most, and their number of values.
+MOST_LANES, MOST_VALUES = 32, 4_000_000
 #: Stretches of a transient: fewer are no check, more would be alike.
 STRETCHES = 8
 #: Part of a cycle by which sampled phases differ from block to block: no two blocks of a run then
@@ -262,7 +264,9 @@ def _at_draws(
             columns = slice(ends[run], ends[run + 1])
             expected[rows, :, columns] = measured[run][:, part.shown] - e[:, :, part.shown]
 
-    parts = [slice(k, min(k + LANES, len(natural))) for k in range(0, len(natural), LANES)]
+    # What is called for each block of draws takes as long as some draws; all runs are kept of it.
+    few = max(LANES, min(MOST_LANES, MOST_VALUES // sum(part.size for part in measured)))
+    parts = [slice(k, min(k + few, len(natural))) for k in range(0, len(natural), few)]
     thread_map(work, parts, density.jobs)
     return likelihood, expected
 
