@@ -101,10 +101,7 @@ def compile_ahead() -> None:
 
 
 def compile_here() -> None:
-    """Compile what evaluates, samples and compares a motion.
-
-    First the elimination of a period, to which the other process comes later.
-    """
+    """Compile what evaluates, samples and compares a motion."""
     from bayesoleo.solvers._switching import evaluate, periodic_signal
 
     run = _oscillator()
