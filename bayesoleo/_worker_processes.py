@@ -63,11 +63,12 @@ def process_map[S, T, R](
     *,
     known: Callable[[S], Sequence[Any]] = lambda _: (),
     before: Callable[[], object] = lambda: None,
+    cost: Callable[[T], float] = lambda _: 0.0,
 ) -> list[R]:
     """Apply ``function(shared, item)`` to every item, in this process and others; keep the order.
 
-    This process begins with the first item. Others take items from the end as soon as the work
-    that is left seems worth it, so that short work is done without them.
+    This process begins with the first item of the highest cost. Others take items from the other
+    end as soon as the work that is left seems worth it, so that short work is done without them.
 
     Parameters
     ----------
@@ -83,6 +84,8 @@ def process_map[S, T, R](
         Objects within ``shared`` that results refer to rather than copy.
     before : callable
         What this process does before its first item, while others do theirs.
+    cost : callable
+        About how long an item takes, in any unit: one that takes long must not be the last.
 
     Returns
     -------
@@ -96,7 +99,8 @@ def process_map[S, T, R](
         before()
         return [function(shared, item) for item in work]
     try:
-        return _shared(function, shared, work, jobs, known, before)
+        order = sorted(range(len(work)), key=lambda k: -cost(work[k]))
+        return _shared(function, shared, work, jobs, known, before, order)
     finally:
         _in_use.release()
 
@@ -112,9 +116,10 @@ def _shared[S, T, R](
     jobs: int,
     known: Callable[[S], Sequence[Any]],
     before: Callable[[], object],
+    order: Sequence[int],
 ) -> list[R]:
     """Results of :func:`process_map` by this process and others."""
-    call = _Call(function, shared, work, known)
+    call = _Call(function, shared, work, known, order)
     helpers = [
         threading.Thread(target=call.help, args=(k,), daemon=True)
         for k in range(min(jobs, len(work)) - 1)
@@ -192,9 +197,10 @@ class _Call:
         shared: Any,
         items: list[Any],
         known: Callable[[Any], Sequence[Any]],
+        order: Sequence[int],
     ):
         self.function, self.shared, self.items, self.known = function, shared, items, known
-        self.left = deque(range(len(items)))
+        self.left = deque(order)
         self.found: dict[int, Any] = {}
         self.failed: BaseException | None = None
         self.lock, self.over = threading.Lock(), threading.Event()

@@ -429,3 +429,20 @@ def test_a_message_cut_short_is_no_message():
     np.testing.assert_array_equal(read["large"], np.arange(1e5))
     for cut in (0, 5, 8, 20, 30, 1000, len(whole) - 1):
         assert processes._receive(io.BytesIO(whole[:cut])) is None
+
+
+def begun_at(shared, item):
+    begun = time.monotonic()
+    time.sleep(item)
+    return os.getpid(), begun
+
+
+def test_what_takes_long_is_begun_first_and_here(eager):
+    items = [0.02] * 12 + [0.3] + [0.02] * 12 + [0.2]
+    found = process_map(begun_at, None, items, 2, cost=lambda item: item)
+    here = [(begun, k) for k, (pid, begun) in enumerate(found) if pid == os.getpid()]
+    assert min(here)[1] == 12
+    assert len({pid for pid, _ in found}) == 2
+    # The process that helps takes the short ones, from the last on.
+    helped = [(begun, k) for k, (pid, begun) in enumerate(found) if pid != os.getpid()]
+    assert min(helped)[1] == 24

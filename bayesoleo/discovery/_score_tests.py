@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Any, cast
 
@@ -255,14 +256,16 @@ def score_all(
     failed : dict of str to str
         Reason by effect where the extended model could not be solved.
     """
-    return _of_results(process_map(_apart, base, options, jobs), options)
+    cost = partial(cost_of, base.fit)
+    return _of_results(process_map(_apart, base, options, jobs, cost=cost), options)
 
 
 def score_and_keep(
     base: Base, options: Sequence[Option], jobs: int | None = None
 ) -> tuple[list[Score], dict[str, str], list[list[Block] | Status]]:
     """The same with the columns of each option, by set of shapes, or why there are none."""
-    found = process_map(_apart_with_columns, base, options, jobs)
+    cost = partial(cost_of, base.fit)
+    found = process_map(_apart_with_columns, base, options, jobs, cost=cost)
     scores, failed = _of_results([result for _, result in found], options)
     return scores, failed, [columns for columns, _ in found]
 
@@ -309,6 +312,12 @@ def _apart_with_columns(
     found = columns if isinstance(columns, Status) else _attempt(base, option, columns)
     apart = replace(found, option=cast(Any, None)) if isinstance(found, Score) else found
     return columns, apart
+
+
+def cost_of(fit: ModelFit, option: Option) -> int:
+    """About how long :func:`columns_of` takes: a motion is sought for each set of shapes where an
+    effect has states of its own, and is known elsewhere."""
+    return len(shapes_of(option)) * (len(option.model.dofs) - len(fit.model.dofs))
 
 
 def columns_of(fit: ModelFit, option: Option) -> list[Block] | Status:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.fft
@@ -25,7 +26,7 @@ from bayesoleo.discovery._run_predictions import Prediction, sample_noise
 from bayesoleo.discovery._samples_that_count import without_masked
 from bayesoleo.discovery._scanned_columns import Columns, Scanned
 from bayesoleo.discovery._score_basis import LEAST, coefficients
-from bayesoleo.discovery._score_tests import columns_of
+from bayesoleo.discovery._score_tests import columns_of, cost_of
 from bayesoleo.effects._effect import Effect
 from bayesoleo.error_models._signatures import Signatures, alike, curves_of, equal_shares
 from bayesoleo.estimation._campaign_problem import CampaignProblem
@@ -339,7 +340,7 @@ class FittedSignatures:
         if known is None:
             scales = scales_of(fit, assembly.drive, assembly.native)
             options = assembly.options(scales, None if effects is None else tuple(effects))
-            known = options, process_map(columns_of, fit, options, jobs)
+            known = options, process_map(columns_of, fit, options, jobs, cost=partial(cost_of, fit))
         sensitivity = _sensitivity(fit, noise)
         gram, groups = sensitivity @ sensitivity.T, list[_Group]()
         for place, (option, columns) in enumerate(zip(*known, strict=True)):
