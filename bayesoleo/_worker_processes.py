@@ -654,8 +654,9 @@ def _dumps(value: Any, known: Sequence[Any] = ()) -> Message:
 
 
 def _as_it_is(message: Message) -> Message:
-    """A copy of a message, which does not follow what becomes of its arrays."""
-    return [bytes(part) for part in message]
+    """A copy of a message, which does not follow what becomes of its arrays; where it is read
+    here, they may be written to."""
+    return [bytearray(part) for part in message]
 
 
 def _extremes() -> tuple[Any, ...]:

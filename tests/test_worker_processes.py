@@ -377,9 +377,10 @@ def test_nothing_is_begun_beside_where_that_makes_no_sense(eager, monkeypatch, r
     argument = Unsendable(4) if reason == "cannot be sent" else 4
     assert processes.Beside.begun(where_and_twice, argument, jobs) is None
     monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
-    other = processes.Beside.begun(where_and_twice, 1, 2)  # the processes are free
-    assert processes.Beside.begun(where_and_twice, 1, 2) is None or not processes._in_use.locked()
-    assert other.result()[1] == 2
+    other = processes.Beside.begun(time.sleep, 0.5, 2)  # the processes are free
+    assert processes.Beside.begun(where_and_twice, 1, 2) is None  # and are not now
+    assert other.result() is None
+    assert not processes._in_use.locked()
 
 
 def test_one_that_nobody_waits_for_is_ended(eager):
@@ -407,15 +408,21 @@ def where_and_copied(value):
     return os.getpid(), value
 
 
+def where_and_doubled(value):
+    value *= 2.0  # what a call gets is its own
+    return os.getpid(), value
+
+
 @pytest.mark.parametrize("lost", [False, True])
 def test_a_large_argument_is_taken_as_it_was(eager, monkeypatch, lost):
     if lost:
         processes._worker(0).process.kill()
         monkeypatch.setattr(processes, "_worker", lambda number: processes._workers[number])
     argument = np.ones(2 * processes.LARGE)
-    beside = processes.Beside.begun(where_and_copied, argument, 2)
+    beside = processes.Beside.begun(where_and_doubled, argument, 2)
     argument[:] = 7.0
-    assert np.all(beside.result()[1] == 1.0)
+    assert np.all(beside.result()[1] == 2.0)
+    assert np.all(argument == 7.0)
 
 
 def test_a_message_cut_short_is_no_message():

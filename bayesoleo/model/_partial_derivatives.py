@@ -42,6 +42,8 @@ def partial(expression: sp.Expr, item: sp.Symbol) -> sp.Expr:
         return _of_product(expression, item)
     if expression.is_Pow:
         return _of_power(expression, item)
+    if not _has_rules(expression):  # what no equation may hold is told where it is compiled
+        return sp.diff(expression, item)
     slopes = [partial(argument, item) for argument in expression.args]
     return sp.Add(*(
         _by_argument(expression, k) * slope
@@ -73,11 +75,19 @@ def _of_power(power: sp.Pow, item: sp.Symbol) -> sp.Expr:
     return power * (in_base if grown is _ZERO else in_base + grown * sp.log(base))
 
 
+def _has_rules(function: sp.Expr) -> bool:
+    """Whether an expression is a function of numbers, which says how it depends on each."""
+    numbers = all(isinstance(argument, sp.Expr) for argument in function.args)
+    return numbers and hasattr(function, "fdiff")
+
+
 @lru_cache(maxsize=50_000)
 def _by_argument(function: sp.Function, k: int) -> sp.Expr:
     """Derivative of a function by its argument ``k``, from one."""
     if isinstance(function, sp.Abs):
         return sp.sign(function.args[0])
-    if isinstance(function, sp.sign | sp.Heaviside):
+    if isinstance(function, sp.re | sp.conjugate):  # of what is real
+        return _ONE
+    if isinstance(function, sp.sign | sp.Heaviside | sp.im):
         return _ZERO
     return function.fdiff(k)

@@ -86,3 +86,16 @@ def test_one_symbol_is_replaced_in_all_terms():
     assert with_symbol_as(expression, symbol("absent"), body) is expression
     assert with_symbol_as(X, X, body) == body
     assert with_symbol_as(expression, X, body).subs({A: 2, Y: 3}) == 2 * 7**2 + 7 + 3
+
+
+def test_parts_of_what_is_real_are_itself_and_nothing():
+    """Computer algebra writes the modulus of a power with both where it doubts the exponent."""
+    both = sp.re(X * A, evaluate=False) + sp.conjugate(X**2, evaluate=False)
+    assert partial(both, X) == A + 2 * X
+    assert partial(sp.im(X * A, evaluate=False), X) == 0
+
+
+def test_what_no_equation_may_hold_is_left_to_computer_algebra():
+    either = sp.Piecewise((X**2, X < 1), (A, True))
+    assert partial(either * A, X) == A * sp.Piecewise((2 * X, X < 1), (0, True))
+    assert partial(sp.erf(X), X) == sp.diff(sp.erf(X), X)
