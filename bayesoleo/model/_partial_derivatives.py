@@ -17,7 +17,6 @@ import sympy as sp
 _ZERO, _ONE = sp.Integer(0), sp.Integer(1)
 
 
-@lru_cache(maxsize=100_000)
 def partial(expression: sp.Expr, item: sp.Symbol) -> sp.Expr:
     """Partial derivative by a symbol, impulses dropped.
 
@@ -34,8 +33,12 @@ def partial(expression: sp.Expr, item: sp.Symbol) -> sp.Expr:
     """
     if expression is item:
         return _ONE
-    if item not in symbols_of(expression):
-        return _ZERO
+    # Most parts lack most symbols: only what is more than nothing is kept.
+    return _partial(expression, item) if item in symbols_of(expression) else _ZERO
+
+
+@lru_cache(maxsize=50_000)
+def _partial(expression: sp.Expr, item: sp.Symbol) -> sp.Expr:
     if expression.is_Add:
         return sp.Add(*(partial(term, item) for term in expression.args))
     if expression.is_Mul:
