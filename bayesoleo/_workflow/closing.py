@@ -150,13 +150,9 @@ def close(
         )
         # A search that took long is written with its probabilities before the draws.
         first = not settings.quick or time.monotonic() - begun > WORTH_KEEPING
-        known, ahead = dict[str, xr.Dataset](), None
-        questions, groups, place = no_questions(), None, output.checkpoints
-        beside = None
-        if not first:
-            known = search_groups(loop, stages)
-            shown = None if output.folder is None else finish(task, known, loop.final.fit)
-            beside = begun_beside(ask, shown, settings.jobs)
+        known, shown = (None, None) if first else _shown_early(task, loop, output)
+        beside = None if first else begun_beside(ask, shown, settings.jobs)
+        questions, groups, ahead, place = no_questions(), None, None, output.checkpoints
         if beside is None:
             loop, questions = with_structures(task, loop, answered(ask, callback), stages)
         if first:
@@ -176,8 +172,22 @@ def close(
         return written(task, loop, drawn, output, stages, questions, groups, ahead)
 
 
+def _shown_early(
+    task: Task, loop: ClosedLoop, output: ResultFolder
+) -> tuple[Groups | None, xr.DataTree | None]:
+    """What follows from the search alone, and a tree of it where a report is to be written; nothing
+    where that fails, which is told when it is made again."""
+    stages = Stages()
+    try:
+        known = search_groups(loop, stages)
+        shown = None if output.folder is None else finish(task, known, loop.final.fit)
+    except Exception:
+        return None, None
+    return (None, None) if stages.failed else (known, shown)
+
+
 def _groups_of(
-    task: Task, loop: ClosedLoop, drawn: Drawn | None, stages: Stages, known: Groups
+    task: Task, loop: ClosedLoop, drawn: Drawn | None, stages: Stages, known: Groups | None
 ) -> Groups | None:
     """What does not depend on structures; None where that fails, which is told when it is made
     again."""

@@ -191,6 +191,29 @@ def test_without_a_folder_the_error_carries_what_is_known(campaign, monkeypatch)
     assert caught.value.folder is None
 
 
+def test_what_is_shown_early_may_fail(campaign, tmp_path, monkeypatch):
+    """Then nothing is drawn ahead, and the result is whole."""
+    monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
+    without_draws(monkeypatch)
+    monkeypatch.setattr(closing, "finish", broken)
+    workflow.close(campaign, damper(), replace(SETTINGS, jobs=2), out=tmp_path)
+    summary, page = read_back(tmp_path)
+    assert summary["unfinished"] == []
+    assert "<figure>" in page
+
+
+@pytest.mark.slow
+def test_predictions_that_fail_are_told_once(campaign, tmp_path, monkeypatch):
+    monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
+    without_draws(monkeypatch)
+    monkeypatch.setattr(output, "loop_groups", broken)
+    with pytest.raises(UnfinishedError) as caught:
+        workflow.close(campaign, damper(), replace(SETTINGS, jobs=2), out=tmp_path)
+    summary = check_unfinished(tmp_path, caught.value, "predictions")
+    assert len(summary["unfinished"]) == 1
+
+
+@pytest.mark.slow
 def test_a_sample_that_fails_leaves_the_estimate(campaign, tmp_path, monkeypatch):
     monkeypatch.setattr("bayesoleo._workflow.estimating.draw", broken)
     with pytest.raises(UnfinishedError, match="posterior"):
@@ -286,8 +309,9 @@ def test_files_that_fail_beside_the_figures_are_tried_again(campaign, tmp_path, 
     assert read_back(tmp_path)[0] == json.loads(tree.attrs[schema.SUMMARY])
 
 
-def _page_of_nothing(_, path, before):
+def _page_of_nothing(_, path, before, ahead):
     before()
+    assert ahead is None  # nothing was drawn before
     path.write_text("no figure", encoding="utf-8")
     return []
 
