@@ -123,9 +123,9 @@ def test_density_is_that_of_its_definition(case):
     np.testing.assert_allclose(model.products_of_all(columns, eta[0]), exact, rtol=1e-2)
 
 
-def test_units_do_not_matter():
-    case = CASES["two outputs, one coloured"]
-    rng, scale = np.random.default_rng(1), 1e3
+@pytest.mark.parametrize("scale", [1e3, 1e-6])
+def test_units_do_not_matter(scale):
+    case, rng = CASES["two outputs, one coloured"], np.random.default_rng(1)
     one, other = (error_model("catalogue", campaign_of(*case, s)) for s in (1.0, scale))
     eta = rng.normal(0, 0.5, (2, len(one.names)))
     residuals = [rng.standard_normal((2, 2, n)) for n in case[1]]
