@@ -47,11 +47,16 @@ def is_marked() -> bool:
 
 def begin(jobs: int | None) -> bool:
     """Begin, if that was not done; whether another process compiles."""
-    if min(thread_limit(), jobs or available_cores()) < 2:
+    if not has_others(jobs):
         return False
     if not _begun:
         _begun.append(begin_elsewhere(*ELSEWHERE))
     return _begun[0]
+
+
+def has_others(jobs: int | None) -> bool:
+    """Whether another process may work beside this one."""
+    return min(thread_limit(), jobs or available_cores()) > 1
 
 
 def leave_mark() -> None:

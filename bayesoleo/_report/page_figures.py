@@ -32,7 +32,7 @@ def figures_of(
     """All that is drawn, by its place on the page; in several processes."""
     makers, known = _makers(summary), dict[str, list[Any]]()
     if ahead is not None:
-        before()  # while that goes on
+        before()  # the other process goes on drawing meanwhile
         known = dict(ahead())
         makers = {name: maker for name, maker in makers.items() if name not in known}
     first = before if ahead is None else lambda: None

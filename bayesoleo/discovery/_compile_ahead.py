@@ -18,9 +18,9 @@ import numpy as np
 
 from bayesoleo import _first_compilation as first_compilation
 from bayesoleo._compiled import is_compiled
-from bayesoleo._parallel import available_cores, thread_limit
 from bayesoleo._worker_processes import begin_elsewhere
 from bayesoleo.discovery._structure_moments import beside
+from bayesoleo.prediction._periodic_run import FEW_STEPS
 from bayesoleo.solvers._elimination import close_and_sweep
 from bayesoleo.solvers._march import is_march_compiled
 
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from bayesoleo.prediction._periodic_run import RunPredictor
     from bayesoleo.prediction._predictor import Predictor
 
-#: Steps of a period from which shooting is prepared for: on fewer a factorisation of the period
-#: brings most iterations to their end.
-MANY_STEPS = 1024
 #: What a process of low priority gives way to.
 NICE = 10
 
@@ -66,9 +63,9 @@ def compile_shooting_meanwhile(predictor: Predictor, jobs: int | None) -> None:
     jobs : int, optional
         How many may work at once; alone nothing is begun.
     """
-    long = any(run.record.periodic and run.steps > MANY_STEPS for run in predictor.runs)
-    alone = min(thread_limit(), jobs or available_cores()) < 2
-    if long and not alone and not is_march_compiled():
+    # On few steps a factorisation of the period brings most iterations to their end.
+    long = any(run.record.periodic and run.steps > FEW_STEPS for run in predictor.runs)
+    if long and first_compilation.has_others(jobs) and not is_march_compiled():
         begin_elsewhere(__name__, compile_shooting.__name__)
 
 

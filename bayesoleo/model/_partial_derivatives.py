@@ -31,7 +31,7 @@ def partial(expression: sp.Expr, item: sp.Symbol) -> sp.Expr:
     -------
     sympy.Expr
     """
-    if expression is item:
+    if expression.is_Symbol and expression == item:  # two symbols of one name may be two objects
         return _ONE
     # Most parts lack most symbols: only what is more than nothing is kept.
     return _partial(expression, item) if item in symbols_of(expression) else _ZERO

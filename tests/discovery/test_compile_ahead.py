@@ -143,7 +143,7 @@ def test_shooting_is_prepared_for_in_long_runs(monkeypatch, steps, jobs, compile
     oscillator = ahead._oscillator()
     oscillator.steps = steps
     monkeypatch.setattr(ahead, "begin_elsewhere", lambda *call: asked.append(call))
-    monkeypatch.setattr(ahead, "thread_limit", lambda: 2)
+    monkeypatch.setattr(first, "thread_limit", lambda: 2)
     monkeypatch.setattr(ahead, "is_march_compiled", lambda: compiled)
     ahead.compile_shooting_meanwhile(SimpleNamespace(runs=[oscillator]), jobs)
     assert len(asked) == begun

@@ -99,3 +99,11 @@ def test_what_no_equation_may_hold_is_left_to_computer_algebra():
     either = sp.Piecewise((X**2, X < 1), (A, True))
     assert partial(either * A, X) == A * sp.Piecewise((2 * X, X < 1), (0, True))
     assert partial(sp.erf(X), X) == sp.diff(sp.erf(X), X)
+
+
+def test_two_symbols_of_one_name_are_one():
+    """They are two objects where computer algebra has forgotten the first."""
+    again = sp.Symbol.__xnew__(sp.Symbol, "x", real=True)
+    assert again is not X
+    assert partial(again, X) == 1
+    assert partial(A * again**2, X) == 2 * A * X
