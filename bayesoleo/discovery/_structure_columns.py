@@ -12,6 +12,7 @@ lemma by which unknowns are integrated out.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -115,7 +116,8 @@ class Reduced:
     Parameters
     ----------
     gram : ndarray, shape (P, k, k)
-        ``C' V^-1 C`` with ``V`` the covariance of noise, remainder and unknowns.
+        ``C' V^-1 C`` with ``V`` the covariance of noise, remainder and unknowns, and of no effect:
+        few products are asked for beside effects that act, which :meth:`products` gives.
     slope : ndarray, shape (P, k)
         ``C' V^-1 e``.
     square, log_det : ndarray, shape (P,)
@@ -179,9 +181,19 @@ class Reduced:
             None if self.own is None else self.own.of_some(kept, chosen),
         )
 
+    def products(self, rows: Integers, columns: Integers) -> Array:
+        """``C' V^-1 C`` of some columns with others, which are given by indices that broadcast,
+        shape (P, ...)."""
+        found = self.gram[:, rows, columns]
+        if self.own is None:
+            return found
+        white = self.own.white
+        return np.asarray(
+            found - np.einsum("pm...,pm...->p...", white[:, :, rows], white[:, :, columns])
+        )
+
     def with_effects(self, groups: Sequence[Group], sizes: Sequence[float]) -> Reduced:
-        """The same with effects that act in the covariance, whose columns come first and are left
-        out.
+        """The same with effects that act in the covariance, whose columns are left out.
 
         Parameters
         ----------
@@ -190,20 +202,37 @@ class Reduced:
         sizes : sequence of float
             Root mean squares of their moment densities.
         """
+        return self.by_sizes(groups, [sizes])[0]
+
+    def by_sizes(
+        self, groups: Sequence[Group], several: Sequence[Sequence[float]]
+    ) -> list[Reduced]:
+        """The same for one set of sizes after the other."""
         assert self.own is None  # those of one model, all together
-        inner = [column for group in groups for column in group.columns]
+        inner, rest = _inner_and_rest(groups, self.size)
         counts = np.array([len(group.columns) for group in groups])
-        power = np.repeat(moment_power(np.array(sizes), counts), counts)
-        root, index = np.sqrt(power)[:, None], np.array(inner, dtype=int)
-        rest = [k for k in range(self.size) if k not in inner]
-        precision = np.eye(index.size) + root * self.gram[:, index[:, None], index] * root.T
-        half = np.linalg.solve(root_of(precision, 1.0), np.eye(index.size))
-        covariance = np.swapaxes(half, 1, 2) @ half
-        mean = covariance @ (root * self.slope[:, index, None])
-        gain = covariance @ (root * self.gram[:, index[:, None], rest])
-        turned = mean[:, :, 0].T, np.moveaxis(covariance, 0, 2), np.moveaxis(gain, 0, 1)
-        own = Amplitudes(tuple(groups), *turned)
-        return replace(self.with_columns(inner, power, rest), own=own)
+        power = np.repeat(moment_power(np.array(several), counts), counts, axis=1)
+        root = np.sqrt(power)[:, None, :, None]
+        along = self.gram[:, inner]
+        unit = np.eye(power.shape[1])
+        lower = root_of(unit + root * along[:, :, inner] * np.swapaxes(root, 2, 3), 1.0)
+        half = np.linalg.solve(lower, unit)
+        rows = np.concatenate([self.slope[:, inner, None], along[:, :, rest]], axis=2)
+        white = half @ (root * rows)  # (sizes, P, m, 1 + k)
+        turned = np.swapaxes(half, 2, 3)
+        covariance, moved = turned @ half, turned @ white
+        first, others = white[..., 0], white[..., 1:]
+        gram, slope = self.gram[:, rest][:, :, rest], self.slope[:, rest]
+        slope = slope - np.einsum("tpm,tpmk->tpk", first, others)
+        square = self.square - np.sum(first**2, axis=2)
+        log_det = self.log_det + 2.0 * np.log(np.diagonal(lower, axis1=2, axis2=3)).sum(axis=2)
+        found = []
+        for t in range(len(several)):
+            mean, gain = moved[t, :, :, 0].T, np.moveaxis(moved[t, :, :, 1:], 0, 1)
+            spread = np.moveaxis(covariance[t], 0, 2)
+            own = Amplitudes(tuple(groups), mean, spread, gain, others[t])
+            found.append(Reduced(gram, slope[t], square[t], log_det[t], own))
+        return found
 
     def log_moment(self, likelihood: Likelihood) -> Array:
         """Logarithm of the moment of effects that act, if nothing else does, shape (P,)."""
@@ -282,12 +311,16 @@ class Amplitudes:
     covariance : ndarray, shape (m, m, P)
     gain : ndarray, shape (m, P, k)
         By how much the mean falls with the amplitude of each further column.
+    white : ndarray, shape (P, m, k)
+        Products of these rows with each other are what the effects take from those of the further
+        columns.
     """
 
     groups: tuple[Group, ...]
     mean: Array
     covariance: Array
     gain: Array
+    white: Array
 
     @property
     def counts(self) -> list[int]:
@@ -301,8 +334,10 @@ class Amplitudes:
 
     def of_some(self, parts: Integers, columns: Integers) -> Amplitudes:
         """The same for some covariances and further columns."""
-        gain = self.gain[:, parts[:, None], columns]
-        return Amplitudes(self.groups, self.mean[:, parts], self.covariance[:, :, parts], gain)
+        gain, white = self.gain[:, parts[:, None], columns], self.white[parts][:, :, columns]
+        return Amplitudes(
+            self.groups, self.mean[:, parts], self.covariance[:, :, parts], gain, white
+        )
 
 
 @dataclass(frozen=True)
@@ -416,6 +451,17 @@ class Group:
     positive: float = 0.5
 
 
+def _inner_and_rest(
+    groups: Sequence[Group], size: int
+) -> tuple[slice | list[int], slice | list[int]]:
+    """Columns of some groups, and all others of so many: where the former come first nothing is
+    copied."""
+    inner = [column for group in groups for column in group.columns]
+    if inner == list(range(len(inner))):
+        return slice(0, len(inner)), slice(len(inner), None)
+    return inner, [k for k in range(size) if k not in inner]
+
+
 def in_a_row(groups: Sequence[Group], start: int) -> tuple[Group, ...]:
     """Groups with their columns one after the other."""
     found = []
@@ -439,6 +485,14 @@ def log_sum(logs: Array) -> Array:
     top = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide="ignore"):  # there may be nothing
         return np.asarray(np.log(np.sum(np.exp(logs - top), axis=0)) + top)
+
+
+def log_sum_of(logs: Sequence[float]) -> float:
+    """The same of a few numbers, of which arrays would take most of the time."""
+    top = max(logs)
+    if not math.isfinite(top):
+        return top
+    return top + math.log(sum(math.exp(one - top) for one in logs))
 
 
 def mean_of(logs: Array) -> float:

@@ -304,7 +304,7 @@ class _At:
         """With the anchor's own effects, whose columns come first, in the covariance."""
         if not self.own:
             return [parts]
-        return [parts.with_effects(self.own, sizes) for sizes in self._own_sizes()]
+        return parts.by_sizes(self.own, self._own_sizes())
 
     def _own_sizes(self) -> list[tuple[float, ...]]:
         """Sizes of the anchor's own effects, over a grid."""

@@ -134,7 +134,7 @@ def _singly(
         covariance,
         gain[..., None],
         np.ascontiguousarray(parts.slope[:, index]),
-        np.ascontiguousarray(parts.gram[:, index, index]),
+        np.ascontiguousarray(parts.products(index, index)),
         parts.square,
         parts.log_det,
         moment_power(sizes, 1),
@@ -152,7 +152,7 @@ def _together(
 ) -> Array:
     """Log evidence of an effect with several amplitudes, shape (P, sizes)."""
     index = np.array(group.columns)
-    values, vectors = np.linalg.eigh(parts.gram[:, index[:, None], index])
+    values, vectors = np.linalg.eigh(parts.products(index[:, None], index))
     turned = (np.swapaxes(vectors, 1, 2) @ parts.slope[:, index, None])[:, None, :, 0]
     power = moment_power(sizes, index.size)[:, None]
     spread = power / (1.0 + power * np.maximum(values, 0.0)[:, None])  # (P, sizes, amplitudes)
@@ -206,10 +206,10 @@ def pair_evidence(
     pairs(
         np.array([[one.positive, group.positive] for group in others]),
         np.ascontiguousarray(parts.slope[:, i]),
-        np.ascontiguousarray(parts.gram[:, i, i]),
+        np.ascontiguousarray(parts.products(np.array(i), np.array(i))),
         np.ascontiguousarray(parts.slope[:, index]),
-        np.ascontiguousarray(parts.gram[:, index, index]),
-        np.ascontiguousarray(parts.gram[:, i, index]),
+        np.ascontiguousarray(parts.products(index, index)),
+        np.ascontiguousarray(parts.products(np.array(i), index)),
         parts.square,
         parts.log_det,
         moment_power(sizes, 1),

@@ -11,6 +11,7 @@ each balance.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -38,6 +39,7 @@ from bayesoleo.discovery._refit import new_parameters, quick_fit
 from bayesoleo.discovery._score_basis import Base
 from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._spectral_data import EstimatedModel, scan_prior
+from bayesoleo.discovery._structure_columns import log_sum_of
 from bayesoleo.discovery._structure_comparison import (
     Columns,
     Comparison,
@@ -65,6 +67,7 @@ LESS = 0.3
 #: probable structure.
 LIKELY = 0.1
 DEFAULT_PRIOR = StructurePrior()
+LOG_2 = math.log(2.0)
 #: Effects and unnamed functions that are considered beside the effects of an anchor.
 BESIDE, BEST_CURVES = 40, 3
 #: Part of the log evidence for an effect that its score may miss, the same of one whose shapes are
@@ -102,9 +105,14 @@ class Evidence:
     #: Sets of several effects, by the other effects that they were compared beside.
     _several: dict[frozenset[Added], set[frozenset[Added]]] = field(default_factory=dict)
     _shaped: set[Added] = field(init=False)
+    _weights: dict[Added, float] = field(init=False)
+    _shares: dict[frozenset[Added], float] = field(default_factory=dict)
+    #: Evidence with what may resemble others, until there is more.
+    _whole: Evidences = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.columns = self.comparison.columns()
+        self._weights = self.comparison.weights
         prior = self.comparison.prior
         self._resemblance = prior.resemblance(self.comparison.families)
         options = [s.option for s in (*self.comparison.scores, *self.comparison.later)]
@@ -134,6 +142,7 @@ class Evidence:
         own = frozenset(anchor.effects)
         if not np.isfinite([result[own, False], result[own, True]]).all():
             return  # an estimate that failed, about which nothing is known
+        self._whole.clear()
         result = {key: value for key, value in result.items() if np.isfinite(value)}
         if self._chosen is None:
             self._chosen = best_alone(result, BESIDE)
@@ -163,19 +172,35 @@ class Evidence:
         effects, outside = key
         if not outside:
             return self.found[key]
-        prior, share = self.comparison.prior, self._resemblance
+        if key not in self._whole:
+            self._whole[key] = self._with_likeness(effects)
+        return self._whole[key]
+
+    def _with_likeness(self, effects: frozenset[Added]) -> float:
+        """Log evidence of some effects with something outside that may resemble others."""
+        found = self.found
         like = [
-            value + prior.log_of_set([share[one]])
+            value + self._log_share(frozenset({one}))
             for one, value in self._similar.get(effects, {}).items()
         ]
         # Several resemble whatever is missing so nearly that half the time no difference is seen.
         for more in self._several.get(effects, ()):
-            beyond = self.found.get((effects | more, True), -np.inf)
-            here = np.logaddexp(self.found[effects | more, False], beyond) - np.log(2.0)
-            like.append(here + prior.log_of_set([share[one] for one in more]))
-        if not like:
-            return self.found[key]
-        return float(np.logaddexp(self.found[key], logsumexp(like)) - np.log(2.0))
+            both = [found[effects | more, False], found.get((effects | more, True), -math.inf)]
+            like.append(log_sum_of(both) - LOG_2 + self._log_share(more))
+        alone = found[effects, True]
+        return log_sum_of([alone, log_sum_of(like)]) - LOG_2 if like else alone
+
+    def _log_share(self, effects: frozenset[Added]) -> float:
+        """Logarithm of the probability that what is outside resembles some effects together."""
+        if effects not in self._shares:
+            share = [self._resemblance[one] for one in effects]
+            self._shares[effects] = self.comparison.prior.log_of_set(share)
+        return self._shares[effects]
+
+    def _height(self, key: Key) -> float:
+        """Logarithm of a structure's probability, but for a constant."""
+        effects, (prior, weights) = tuple(sorted(key[0])), (self.comparison.prior, self._weights)
+        return self.evidence_of(key) + prior.log_probability(effects, key[1], weights)
 
     def posterior(self) -> StructurePosterior:
         """Probabilities by the evidence and the prior.
@@ -187,14 +212,8 @@ class Evidence:
         """
         if not self.found:
             raise ArithmeticError("the evidence of the declared model is not a number")
-        prior, weights = self.comparison.prior, self.comparison.weights
         keys = list(self.found)
-        logs = np.array(
-            [
-                self.evidence_of(key) + prior.log_probability(tuple(key[0]), key[1], weights)
-                for key in keys
-            ]
-        )
+        logs = np.array([self._height(key) for key in keys])
         probability = np.exp(logs - logsumexp(logs))
         structures = [
             Structure(
@@ -205,7 +224,7 @@ class Evidence:
         by_probability = sorted(structures, key=lambda item: -item.probability)
         names = next(iter(self._anchors.values())).fit.problem.names
         shared = averaged(by_probability, self._anchors, self.comparison, self.columns, names)
-        return StructurePosterior(tuple(by_probability), prior, shared)
+        return StructurePosterior(tuple(by_probability), self.comparison.prior, shared)
 
     def estimated(self, key: Key) -> bool:
         """Whether a structure's effects were estimated together."""
@@ -225,13 +244,11 @@ class Evidence:
         Scores of large effects miss much. A function of phase misses nothing, and would be
         preferred to effects that nobody estimated.
         """
-        prior, weights = self.comparison.prior, self.comparison.weights
         best: dict[tuple[int, bool], tuple[float, tuple[Added, ...]]] = {}
         for key in self.found:
             effects = tuple(sorted(key[0]))
-            height = self.evidence_of(key) + prior.log_probability(effects, key[1], weights)
             place = (len(effects), key[1])
-            best[place] = max(best.get(place, (-np.inf, ())), (height, effects))
+            best[place] = max(best.get(place, (-np.inf, ())), (self._height(key), effects))
         if not best:
             return []
         closed = max((item for place, item in best.items() if not place[1]), default=(0.0, ()))
@@ -252,12 +269,9 @@ class Evidence:
         least : float
             Logarithm of the smallest ratio to the most probable structure.
         """
-        prior, weights = self.comparison.prior, self.comparison.weights
         height: dict[frozenset[Added], float] = {}
         for key in self.found:
-            value = self.evidence_of(key)
-            value += prior.log_probability(tuple(key[0]), key[1], weights)
-            height[key[0]] = max(value, height.get(key[0], -np.inf))
+            height[key[0]] = max(self._height(key), height.get(key[0], -np.inf))
         best = max(height.values(), default=-np.inf)
         likely = [effects for effects, value in height.items() if value > best + least]
         ordered = sorted(likely, key=lambda one: -height[one])
@@ -275,7 +289,7 @@ class Evidence:
         least : float
             Logarithm of the smallest ratio to the most probable structure.
         """
-        prior, weights = self.comparison.prior, self.comparison.weights
+        prior, weights = self.comparison.prior, self._weights
         height: dict[tuple[Added, ...], float] = {}
         best = -np.inf
         for key, value in self.found.items():
