@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import ctypes
 import pickle
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cached_property, lru_cache, wraps
 from math import prod
@@ -27,6 +27,7 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
 
+from bayesoleo._compiled_sources import stamp_of
 from bayesoleo._machine_code import COMPILING, address_of, sealed, unsealed, write_durably
 from bayesoleo._one_compilation import in_one_process
 from bayesoleo._types import Array, Integers
@@ -38,23 +39,31 @@ _config: Any = numba_config
 
 
 class _CheckedFile(_CacheFile):  # type: ignore[misc]
-    """Files in which Numba keeps what it compiled of a function; those that are not whole are not
-    there."""
+    """Files in which Numba keeps what it compiled of a function; those that are not whole, or of
+    other sources, are not there."""
 
-    def __init__(self, cache_path: str, filename_base: str, source_stamp: Any) -> None:
+    def __init__(
+        self, cache_path: str, filename_base: str, function: Callable[..., Any], options: str
+    ) -> None:
         # Another name than that of files without checksums, which others may read.
-        super().__init__(cache_path, f"{filename_base}.sha256", source_stamp)
+        super().__init__(cache_path, f"{filename_base}.sha256", None)
+        self._function, self._options = function, options
+
+    @cached_property
+    def _stamp(self) -> str:
+        # Not when the function is made: it may call what its module makes later.
+        return f"{stamp_of(self._function)} {self._options}"
 
     def _load_index(self) -> dict[Any, str]:
         content = unsealed(self._index_path)
         if content is None:
             return {}
         version, stamp, overloads = pickle.loads(content)
-        current = (version, stamp) == (self._version, self._source_stamp)
+        current = (version, stamp) == (self._version, self._stamp)
         return cast(dict[Any, str], overloads) if current else {}
 
     def _save_index(self, overloads: dict[Any, str]) -> None:
-        content = self._dump((self._version, self._source_stamp, overloads))
+        content = self._dump((self._version, self._stamp, overloads))
         write_durably(Path(self._index_path), sealed(content))
 
     def _load_data(self, name: str) -> Any:
@@ -102,20 +111,21 @@ def is_compiled(function: Any) -> bool:
 
 
 class _CheckedCache(_FunctionCache):  # type: ignore[misc]
-    """Numba's cache of a function, in files with checksums."""
+    """Numba's cache of a function, compiled with some options, in files with checksums."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., Any], options: Mapping[str, Any]) -> None:
         super().__init__(function)
         self._cache_file = _CheckedFile(
             cache_path=self._cache_path,
             filename_base=self._impl.filename_base,
-            source_stamp=self._impl.locator.get_source_stamp(),
+            function=function,
+            options=f"{sorted(options.items())}, level {LEVEL}",
         )
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing was compiled of the function on this machine."""
-        return not Path(self._cache_file._index_path).is_file()
+        """Whether nothing was compiled of the function, as it is now, on this machine."""
+        return not self._cache_file._load_index()
 
     def holds(self, signature: Any, target: Any) -> bool:
         """Whether something was compiled before for these arguments."""
@@ -176,7 +186,7 @@ def cached[F: Callable[..., Any]](**options: Any) -> Callable[[F], F]:
     def decorate(function: F) -> F:
         made: Any = numba.njit(nogil=True, **options)(function)
         if hasattr(made, "enable_caching"):  # it is plain Python where NUMBA_DISABLE_JIT is set
-            made._cache = _CheckedCache(function)
+            made._cache = _CheckedCache(function, options)
             made.compile = _compiler_of(made)
         return cast(F, made)
 
