@@ -120,11 +120,12 @@ def scaling(model: Model, records: Sequence[Record]) -> dict[str, float]:
 
 def _seconds(batches: Sequence[Batch], rounds: int = 7) -> list[float]:
     """Least CPU time of each batch on one thread; in turns, so that what slows the machine for a
-    while slows all of them."""
+    while slows all of them, and more than once in a turn: a sampler solves the same model again and
+    again, with no other one's arrays in the cache."""
     least = [np.inf] * len(batches)
     for _ in range(rounds):
         for k, work in enumerate(batches):
-            least[k] = min(least[k], cpu(lambda work=work: work.run(1), 1))
+            least[k] = min(least[k], cpu(lambda work=work: work.run(1), 3))
     return least
 
 
