@@ -20,9 +20,9 @@ from bayesoleo import _first_compilation as first_compilation
 from bayesoleo._compiled import is_compiled
 from bayesoleo._worker_processes import begin_elsewhere
 from bayesoleo.discovery._structure_moments import beside
-from bayesoleo.prediction._periodic_run import FEW_STEPS
 from bayesoleo.solvers._elimination import close_and_sweep
 from bayesoleo.solvers._march import is_march_compiled
+from bayesoleo.solvers._periodic_newton import compile_iteration
 
 if TYPE_CHECKING:
     from bayesoleo.prediction._periodic_run import RunPredictor
@@ -63,6 +63,8 @@ def compile_shooting_meanwhile(predictor: Predictor, jobs: int | None) -> None:
     jobs : int, optional
         How many may work at once; alone nothing is begun.
     """
+    from bayesoleo.prediction._periodic_run import FEW_STEPS
+
     # On few steps a factorisation of the period brings most iterations to their end.
     long = any(run.record.periodic and run.steps > FEW_STEPS for run in predictor.runs)
     if long and first_compilation.has_others(jobs) and not is_march_compiled():
@@ -86,10 +88,15 @@ def _is_done() -> bool:
 
 
 def compile_ahead() -> None:
-    """Compile in a process of its own what takes longest, in the order of need."""
+    """Compile in a process of its own what takes longest, in the order of need.
+
+    This file imports no model, whose libraries take seconds to load: the first function, which the
+    caller waits for longest, does without.
+    """
     if _is_done():
         first_compilation.leave_mark()
         return
+    compile_iteration()
     run = _oscillator()
     run.set_anchor(_constants(run)[0])
     _compile_evidence()

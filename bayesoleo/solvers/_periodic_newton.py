@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numba import carray
@@ -31,11 +31,13 @@ from bayesoleo._compiled import (
     jit,
     numbers,
     pointer,
+    record,
 )
 from bayesoleo._types import Array, Integers
 from bayesoleo.solvers._elimination import LARGEST_GROWTH, close as solve_closure, close_balanced
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._period_arrangement import (
+    NO_LINE,
     LinearStart,
     Options,
     Sizes,
@@ -288,6 +290,22 @@ def solve_lanes(
         status[lane], iterations[lane] = _iterate(pieces, sizes, sweep, work, options)
         if status[lane] != NEEDS_EXCHANGE:
             _in_order(sizes, sweep, work.now, solution)
+
+
+def compile_iteration() -> None:
+    """Compile the iteration for what it is called with, or load it, by lanes of which there are
+    none: no model is needed for it, nor the libraries of one."""
+    status = np.empty(0, dtype=np.int64)
+    solve_lanes(
+        _nothing(SweepKernels), _nothing(Sizes), _nothing(Sweep), _nothing(Work),
+        Options(0, True, False), np.empty((0, 1)), np.empty((0, 1, 1)), NO_LINE, status,
+        status.copy(),
+    )  # fmt: skip
+
+
+def _nothing[T: tuple[Any, ...]](kind: type[T]) -> T:
+    named = cast(Any, kind)
+    return record(cast(T, named(*[0] * len(named._fields))))
 
 
 @inner

@@ -79,6 +79,9 @@ def test_two_processes_compile_everything_once(tmp_path):
     for module, name in (*LONG, *SHORT):
         own = [file for file in compiled(tmp_path) if file.startswith(f"{module}.{name}-")]
         assert len(own) == 1, name
+    # Without a problem it was compiled for what a problem calls it with.
+    iteration = [file.name for file in tmp_path.rglob("*.nbc") if ".solve_lanes-" in file.name]
+    assert len(iteration) == 1
     assert list(tmp_path.glob("compiled-*"))
     before = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.nb[ic]")}
     run(
