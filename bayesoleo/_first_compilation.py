@@ -15,8 +15,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from bayesoleo._cache_folder import user_cache
+from bayesoleo._kept_processes import begin_elsewhere
 from bayesoleo._parallel import available_cores, thread_limit
-from bayesoleo._worker_processes import begin_elsewhere
 
 #: What the process does: a module, and a function without arguments.
 ELSEWHERE = ("bayesoleo.discovery._compile_ahead", "compile_ahead")

@@ -10,49 +10,33 @@ it is sent, only costs time: its work is done here.
 
 from __future__ import annotations
 
-import atexit
-import gc
-import importlib
-import io
-import json
-import os
-import pickle
-import select
-import struct
-import subprocess
-import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from typing import Any, BinaryIO, Self, cast
+from typing import Any, Self, cast
 
 import bayesoleo._parallel as parallel
+from bayesoleo._kept_processes import (
+    ERROR,
+    VALUE,
+    LostError,
+    Worker,
+    forget,
+    kept,
+    kill_processes,
+    process_of,
+    sent,
+    usable,
+)
+from bayesoleo._process_messages import Message, as_it_is, dumps, loads
 
 #: Seconds of work left, as far as can be seen, from which processes that run already are asked,
 #: and from which one is started.
 WORTH_ASKING, WORTH_STARTING = 0.5, 4.0
 #: Seconds between looks at whether they are worth asking.
 LOOK = 0.05
-#: Seconds without work after which a process ends.
-IDLE = 120.0
-
-#: A message: a pickle, and the memory of its large arrays, which is not copied into it.
-type Message = list[memoryview | bytes | bytearray]
-_HEADER = struct.Struct("<Q")
-#: Bytes from which an array is sent beside the pickle: arrays take a copy less on either side.
-LARGE = 2**16
-#: It finds modules where its parent finds them, and does not run the user's script again.
-_CHILD = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[1]);"
-    " from bayesoleo._worker_processes import serve; serve(sys.argv[2:])"
-)
-_READY, _VALUE, _ERROR, _UNREADABLE = "ready", "value", "error", "unreadable"
-
-
-class _LostError(Exception):
-    """A process ended, or cannot read what it was sent."""
 
 
 def process_map[S, T, R](
@@ -94,7 +78,7 @@ def process_map[S, T, R](
     """
     work = list(items)
     jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
-    alone = jobs <= 1 or len(work) <= 1 or not _usable()
+    alone = jobs <= 1 or len(work) <= 1 or not usable()
     if alone or not _in_use.acquire(blocking=False):
         before()
         return [function(shared, item) for item in work]
@@ -154,38 +138,9 @@ def start_ahead(modules: Sequence[str] = OF_A_SEARCH, jobs: int | None = None) -
         As of :func:`process_map`; with one there is nothing to start.
     """
     jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
-    if jobs > 1 and _usable():
-        with suppress(_LostError):
-            _worker(0, modules)
-
-
-def load(modules: Sequence[str]) -> None:
-    """Load modules in a process of this package's own, which needs them until it ends.
-
-    There is no garbage in them: half a million objects are kept out of all searches for it.
-
-    Parameters
-    ----------
-    modules : sequence of str
-        Where all are loaded, nothing is done.
-    """
-    if all(name in sys.modules for name in modules):
-        return
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        for name in modules:
-            importlib.import_module(name)
-    finally:
-        gc.freeze()
-        if was_on:
-            gc.enable()
-
-
-def _usable() -> bool:
-    """Whether processes may be started: not by a worker, nor where the user forbids it."""
-    asked = os.environ.get("BAYESOLEO_PROCESSES", "")
-    return asked != "0" and bool(sys.executable)
+    if jobs > 1 and usable():
+        with suppress(LostError):
+            process_of(0, modules)
 
 
 class _Call:
@@ -248,20 +203,20 @@ class _Call:
             time.sleep(LOOK)
         index: int | None = None
         try:
-            worker = _worker(number)
+            worker = process_of(number)
             worker.ask(self._message())  # what all calls need
             objects = self.known(self.shared)
             while (index := self._take(last=True)) is not None:
-                kind, value = worker.ask(_sent((index, self.items[index]), objects), objects)
-                if kind == _ERROR:
+                kind, value = worker.ask(sent((index, self.items[index]), objects), objects)
+                if kind == ERROR:
                     self.failed = value
                 else:
                     self.found[index] = value
                 index = None
                 self.over.set()
-            worker.ask(_dumps((None, None, None)))  # it needs no memory until the next call
-        except _LostError:
-            _forget(number)
+            worker.ask(dumps((None, None, None)))  # it needs no memory until the next call
+        except LostError:
+            forget(number)
             if index is not None:
                 self._give_back(index)
         except BaseException as error:  # it must not be lost with the thread
@@ -273,13 +228,13 @@ class _Call:
         """Whether the work that is left is worth another process, by the time of that done."""
         took = time.perf_counter() - self.begun
         each = took / max(len(self.found), 1)
-        least = WORTH_ASKING if number in _workers else WORTH_STARTING
+        least = WORTH_ASKING if number in kept else WORTH_STARTING
         return took > LOOK and each * len(self.left) > least
 
     def _message(self) -> Message:
         with self.lock:
             if not self._sent:
-                self._sent = _sent((self.function, self.shared, self.known))
+                self._sent = sent((self.function, self.shared, self.known))
             return self._sent
 
 
@@ -305,7 +260,7 @@ class StandingCall[S, T, R]:
     def __init__(self, function: Callable[[S, T], R], shared: S, jobs: int | None = None) -> None:
         jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
         self.function, self.shared, self._most = function, shared, jobs - 1
-        self._ready: dict[int, _Worker] = {}
+        self._ready: dict[int, Worker] = {}
         self._begun, self._mine = list[threading.Thread](), False
 
     @property
@@ -323,9 +278,9 @@ class StandingCall[S, T, R]:
         item : object
             Done by each of them first, for which it loads what it needs.
         """
-        if self._begun or self._most < 1 or not _usable():
+        if self._begun or self._most < 1 or not usable():
             return
-        if took < self.WORTH[not _workers] or not _in_use.acquire(blocking=False):
+        if took < self.WORTH[not kept] or not _in_use.acquire(blocking=False):
             return
         self._mine = True
         for number in range(self._most):
@@ -334,10 +289,10 @@ class StandingCall[S, T, R]:
             self._begun.append(thread)
 
     def _prepare(self, number: int, item: T) -> None:
-        with suppress(_LostError):
-            worker = _worker(number)
-            worker.ask(_sent((self.function, self.shared, None)))
-            if worker.ask(_sent((0, item)))[0] != _ERROR:
+        with suppress(LostError):
+            worker = process_of(number)
+            worker.ask(sent((self.function, self.shared, None)))
+            if worker.ask(sent((0, item)))[0] != ERROR:
                 self._ready[number] = worker
 
     def __call__(self, items: Sequence[T]) -> list[R]:
@@ -347,17 +302,17 @@ class StandingCall[S, T, R]:
         found: dict[int, R] = {}
         failed: list[BaseException] = []
 
-        def ask(number: int, worker: _Worker, index: int) -> None:
+        def ask(number: int, worker: Worker, index: int) -> None:
             try:
-                kind, value = worker.ask(_sent((index, items[index])))
-                if kind == _ERROR:
+                kind, value = worker.ask(sent((index, items[index])))
+                if kind == ERROR:
                     failed.append(value)
                 else:
                     found[index] = value
-            except _LostError:
+            except LostError:
                 # One that is started in its place would not know what to do.
                 self._ready.pop(number, None)
-                _forget(number)
+                forget(number)
 
         threads = [
             threading.Thread(target=ask, args=(*one, 1 + k), daemon=True)
@@ -388,8 +343,8 @@ class StandingCall[S, T, R]:
         for thread in self._begun:
             thread.join()
         for worker in self._ready.values():
-            with suppress(_LostError):
-                worker.ask(_dumps((None, None, None)))
+            with suppress(LostError):
+                worker.ask(dumps((None, None, None)))
         self._ready, self._mine = {}, False
         _in_use.release()
 
@@ -439,39 +394,39 @@ class Beside[S, R]:
             the process goes on with until :meth:`taken` is called.
         """
         jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
-        if not 1 < jobs <= cls.MOST or not _usable() or not _in_use.acquire(blocking=False):
+        if not 1 < jobs <= cls.MOST or not usable() or not _in_use.acquire(blocking=False):
             return None
         try:
             more = [] if then is None else [(*then[:2], None), *((0, item) for item in then[2])]
-            taken = [_as_it_is(_sent(one)) for one in ((0, argument), *more)]
+            taken = [as_it_is(sent(one)) for one in ((0, argument), *more)]
             return cls(function, taken[0], taken[1:])
         except BaseException as error:
             _in_use.release()
-            if isinstance(error, _LostError):
+            if isinstance(error, LostError):
                 return None
             raise
 
     def _ask(self) -> None:
         try:
-            worker = _worker(0)
-            worker.ask(_sent((_called, self._function, None)))
+            worker = process_of(0)
+            worker.ask(sent((_called, self._function, None)))
             self._found.append(worker.ask(self._message))
             self._message = []
             self._answered.set()
             self._go_on(worker)
-            worker.ask(_dumps((None, None, None)))  # it needs no memory until the next call
-        except _LostError:
-            _forget(0)
+            worker.ask(dumps((None, None, None)))  # it needs no memory until the next call
+        except LostError:
+            forget(0)
         finally:
             self._answered.set()
             _in_use.release()
 
-    def _go_on(self, worker: _Worker) -> None:
+    def _go_on(self, worker: Worker) -> None:
         for number, message in enumerate(self._more):
             if self._enough.is_set():
                 return
             kind, value = worker.ask(message)
-            if kind == _VALUE:
+            if kind == VALUE:
                 self._items[number - 1] = value  # the first message says what is to be done
 
     def __enter__(self) -> Self:
@@ -488,10 +443,10 @@ class Beside[S, R]:
         if not self._more:
             self._thread.join()  # the processes are free again
         if not self._found:
-            _, argument = _loads(self._message)
-            self._found.append((_VALUE, self._function(argument)))
+            _, argument = loads(self._message)
+            self._found.append((VALUE, self._function(argument)))
         kind, value = self._found[0]
-        if kind == _ERROR:
+        if kind == ERROR:
             raise value
         return cast(R, value)
 
@@ -505,288 +460,3 @@ class Beside[S, R]:
 
 def _called(function: Callable[[Any], Any], argument: Any) -> Any:
     return function(argument)
-
-
-# -- processes ------------------------------------------------------------------------------------
-
-_workers: dict[int, _Worker] = {}
-
-
-class _Worker:
-    """A process that waits for work, and the pipes to it."""
-
-    def __init__(self, modules: Sequence[str] = ()) -> None:
-        environment = os.environ | dict.fromkeys(parallel.ONE_THREAD, "1")
-        command = [sys.executable, "-P", "-c", _CHILD, _paths(), *modules]
-        self.process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=environment,
-        )
-
-    def ask(self, message: Message, known: Sequence[Any] = ()) -> tuple[str, Any]:
-        """Send a message and wait for the answer: its kind and its content."""
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        try:
-            _send(cast(BinaryIO, self.process.stdin), message)
-            answer = _receive(cast(BinaryIO, self.process.stdout))
-        except (OSError, ValueError) as error:
-            raise _LostError from error
-        if answer is None:
-            raise _LostError
-        try:
-            kind, value = _loads(answer, known)
-        except Exception as error:
-            raise _LostError from error
-        if kind == _UNREADABLE:
-            raise _LostError
-        return kind, value
-
-    def end(self) -> None:
-        """End the process, and close the pipes to it."""
-        self.process.kill()
-        for pipe in (self.process.stdin, self.process.stdout):
-            if pipe is not None:
-                with suppress(OSError):
-                    pipe.close()
-        self.process.wait()
-
-
-def _paths() -> str:
-    """Where modules are found; an import passes over what is no text."""
-    return json.dumps([one for one in sys.path if isinstance(one, str)])
-
-
-def _worker(number: int, modules: Sequence[str] = ()) -> _Worker:
-    """The process of a number, started where there is none or it has ended."""
-    known = _workers.get(number)
-    if known is not None and known.process.poll() is not None:
-        _forget(number)
-        known = None
-    if known is None:
-        try:
-            known = _workers[number] = _Worker(modules)
-        except OSError as error:  # no memory, or too many processes
-            raise _LostError from error
-    return known
-
-
-def _forget(number: int) -> None:
-    worker = _workers.pop(number, None)
-    if worker is not None:
-        worker.end()
-
-
-def kill_processes() -> None:
-    """Kill all processes that are kept; whoever waits for one finds it lost."""
-    for worker in list(_workers.values()):
-        worker.process.kill()
-
-
-@atexit.register
-def end_processes() -> None:
-    """End all processes that are kept."""
-    for number in list(_workers):
-        _forget(number)
-
-
-if hasattr(os, "register_at_fork"):  # pipes belong to the process that made them
-    os.register_at_fork(after_in_child=_workers.clear)
-
-
-def begin_elsewhere(module: str, function: str) -> bool:
-    """Call a function without arguments in a process that nobody waits for; whether one was begun.
-
-    It is killed where this process ends before it does.
-    """
-    if not _usable():
-        return False
-    code = f"import json, sys; sys.path[:] = json.loads(sys.argv[1]); import {module} as m"
-    with suppress(OSError):
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-c", f"{code}; m.{function}()", _paths()],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        atexit.register(_end, process)
-        return True
-    return False
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    process.kill()
-    process.wait()
-
-
-# -- messages -------------------------------------------------------------------------------------
-
-
-def _dumps(value: Any, known: Sequence[Any] = ()) -> Message:
-    """A pickle by value of what no module holds; known objects are referred to by number."""
-    import cloudpickle
-
-    number = {id(one): k for k, one in enumerate(known)}
-    extremes = _extremes()
-
-    class Pickler(cloudpickle.Pickler):  # type: ignore[misc]
-        def persistent_id(self, one: Any) -> int | None:
-            return number.get(id(one))
-
-        def reducer_override(self, one: Any) -> Any:
-            if isinstance(one, extremes):
-                return _as_it_was, (type(one), one.args)
-            return super().reducer_override(one)
-
-    stream, large = io.BytesIO(), list[memoryview]()
-
-    def is_small(buffer: pickle.PickleBuffer) -> bool:
-        memory = buffer.raw()
-        if memory.nbytes >= LARGE:
-            large.append(memory)
-        return memory.nbytes < LARGE
-
-    Pickler(stream, protocol=pickle.HIGHEST_PROTOCOL, buffer_callback=is_small).dump(value)
-    return [stream.getvalue(), *large]
-
-
-def _as_it_is(message: Message) -> Message:
-    """A copy of a message, which does not follow what becomes of its arrays; where it is read
-    here, they may be written to."""
-    return [bytearray(part) for part in message]
-
-
-def _extremes() -> tuple[Any, ...]:
-    """SymPy's largest and smallest of several, if anything may hold one."""
-    module = sys.modules.get("sympy")
-    return () if module is None else (module.Max, module.Min)
-
-
-def _as_it_was(kind: Any, arguments: tuple[Any, ...]) -> Any:
-    """One of them again. To make it anew compares all arguments with each other, which takes as
-    long as to estimate a candidate."""
-    return kind(*arguments, evaluate=False)
-
-
-def _sent(value: Any, known: Sequence[Any] = ()) -> Message:
-    """The same for a process; what cannot be sent is done here."""
-    try:
-        return _dumps(value, known)
-    except Exception as error:
-        raise _LostError from error
-
-
-def _loads(message: Message, known: Sequence[Any] = ()) -> Any:
-    class Unpickler(pickle.Unpickler):
-        def persistent_load(self, number: Any) -> Any:
-            return known[number]
-
-    content, *large = message
-    return Unpickler(io.BytesIO(content), buffers=large).load()
-
-
-def _send(pipe: BinaryIO, message: Message) -> None:
-    sizes = [len(message), *(len(part) for part in message)]
-    pipe.write(b"".join(map(_HEADER.pack, sizes)))
-    for part in message:
-        pipe.write(part)
-    pipe.flush()
-
-
-def _receive(pipe: BinaryIO) -> Message | None:
-    """A message; None at the end of the pipe."""
-    count = _number(pipe)
-    if count is None:
-        return None
-    sizes = [_number(pipe) for _ in range(count)]
-    parts: Message = []
-    for size in sizes:
-        part = None if size is None else _filled(pipe, size)
-        if part is None:
-            return None
-        parts.append(part)
-    return parts
-
-
-def _number(pipe: BinaryIO) -> int | None:
-    head = pipe.read(_HEADER.size)
-    return _HEADER.unpack(head)[0] if len(head) == _HEADER.size else None
-
-
-def _filled(pipe: BinaryIO, size: int) -> bytearray | None:
-    """So many bytes, which an array may take for its own memory; None where the pipe ends."""
-    part, at = bytearray(size), 0
-    while at < size:
-        got = pipe.readinto(memoryview(part)[at:])  # type: ignore[attr-defined]
-        if not got:
-            return None
-        at += got
-    return part
-
-
-def serve(modules: Sequence[str]) -> None:
-    """In another process: do what comes, until nothing comes any more.
-
-    Parameters
-    ----------
-    modules : sequence of str
-        To be loaded before anything comes.
-    """
-    import signal
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
-    parallel.limit_threads(1)
-    source, target = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what is printed must not get among the messages
-    load(modules)
-    function, shared, objects = cast(Any, None), None, cast(Sequence[Any], ())
-    while _waits(source):
-        message = _receive(source)
-        if message is None:
-            return
-        try:
-            content = _loads(message, objects)
-        except Exception as error:  # a module that only the parent has
-            _send(target, _dumps((_UNREADABLE, str(error))))
-            continue
-        if len(content) == 3:
-            function, shared, known = content
-            objects = () if known is None else known(shared)
-            _send(target, _dumps((_READY, None)))
-            continue
-        _, item = content
-        try:
-            answer = _answer(function(shared, item), objects)
-        except MemoryError as error:  # there is more where this one's memory is not needed
-            answer = _dumps((_UNREADABLE, str(error)))
-        except Exception as error:
-            answer = _of_error(error)
-        _send(target, answer)
-
-
-def _answer(value: Any, known: Sequence[Any]) -> Message:
-    """A result for the parent; where it cannot be sent, the parent computes it."""
-    try:
-        return _dumps((_VALUE, value), known)
-    except Exception as error:
-        return _dumps((_UNREADABLE, str(error)))
-
-
-def _waits(source: BinaryIO) -> bool:
-    """Whether something comes before it has been idle for too long."""
-    if sys.platform == "win32":
-        return True  # pipes cannot be waited for
-    return bool(select.select([source], [], [], IDLE)[0])
-
-
-def _of_error(error: Exception) -> Message:
-    """An error for the parent; where it cannot be sent, the parent meets it by itself."""
-    try:
-        content = _dumps((_ERROR, error))
-        _loads(content)
-    except Exception:
-        return _dumps((_UNREADABLE, str(error)))
-    return content

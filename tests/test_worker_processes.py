@@ -15,6 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import bayesoleo._kept_processes as kept_processes
+import bayesoleo._process_messages as messages
 import bayesoleo._worker_processes as processes
 from bayesoleo._compiled import COMPILED_ONCE, compilation_told, is_compiled
 from bayesoleo._parallel import limit_threads
@@ -27,13 +29,14 @@ def eager(monkeypatch):
     monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
     monkeypatch.setattr(processes, "WORTH_STARTING", 0.0)
     monkeypatch.setattr(processes, "WORTH_ASKING", 0.0)
-    processes._worker(0).ask(processes._dumps((None, None, None)))  # it answers once it has begun
+    # It answers once it has begun.
+    kept_processes.process_of(0).ask(messages.dumps((None, None, None)))
 
 
 @pytest.fixture(scope="module", autouse=True)
 def ended():
     yield
-    processes.end_processes()
+    kept_processes.end_processes()
 
 
 def slow_square(shared, item):
@@ -69,7 +72,7 @@ def test_a_process_is_kept_for_the_next_call(eager, tmp_path):
 def test_what_a_process_loads_is_kept_out_of_searches_for_garbage(tmp_path):
     (tmp_path / "lasting.py").write_text("kept = [[number] for number in range(1000)]\n")
     code = (
-        "import gc; from bayesoleo._worker_processes import load; before = gc.get_freeze_count();"
+        "import gc; from bayesoleo._kept_processes import load; before = gc.get_freeze_count();"
         " load(['lasting']); import lasting; loaded = gc.get_freeze_count();"
         " later = [[]]; load(['lasting']); assert gc.isenabled();"
         " print(before, loaded - before >= 1000, gc.get_freeze_count() == loaded)"
@@ -82,11 +85,11 @@ def test_what_a_process_loads_is_kept_out_of_searches_for_garbage(tmp_path):
 
 
 def test_short_work_starts_no_process(monkeypatch):
-    processes.end_processes()
+    kept_processes.end_processes()
     monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
     pids = {number for number, _ in process_map(slow_square, {"unit": 1.0}, range(3), 2)}
     assert pids == {os.getpid()}
-    assert not processes._workers
+    assert not kept_processes.kept
 
 
 @pytest.mark.parametrize("reason", ["one job", "limited", "forbidden"])
@@ -200,7 +203,7 @@ def leave_a_mark():
 
 def test_a_call_that_nobody_waits_for(eager, tmp_path, monkeypatch):
     monkeypatch.setenv("MARK", str(tmp_path / "mark"))
-    processes.begin_elsewhere("test_worker_processes", "leave_a_mark")
+    kept_processes.begin_elsewhere("test_worker_processes", "leave_a_mark")
     deadline = time.monotonic() + 60  # a busy machine takes seconds to start a process
     while not (tmp_path / "mark").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -261,11 +264,11 @@ def test_two_threads_do_not_take_each_others_results(eager):
 
 
 def test_files_of_the_folder_are_not_run_and_odd_paths_do_no_harm(eager, tmp_path, monkeypatch):
-    processes.end_processes()
+    kept_processes.end_processes()
     (tmp_path / "json.py").write_text("raise SystemExit")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [*sys.path, tmp_path / "no text"])
-    processes._worker(0).ask(processes._dumps((None, None, None)))
+    kept_processes.process_of(0).ask(messages.dumps((None, None, None)))
     (tmp_path / "marks").mkdir()
     found = process_map(square_in_company, tmp_path / "marks", range(12), 2)
     assert len({number for number, _ in found}) == 2
@@ -277,7 +280,7 @@ def test_the_largest_of_several_comes_back_as_it_was():
 
     x, y, z = sp.symbols("x y z", real=True)
     sent = sp.Max(x, y - 1, sp.Min(z, x * y, 3)) ** 2 + sp.Abs(x)
-    found = processes._loads(processes._dumps({"term": sent}))["term"]
+    found = messages.loads(messages.dumps({"term": sent}))["term"]
     assert found == sent
     assert hash(found) == hash(sent)
     assert sp.diff(found, x) == sp.diff(sent, x)
@@ -310,8 +313,8 @@ def test_what_it_raises_is_raised_where_the_result_is_asked_for(eager):
 def test_the_argument_is_taken_as_it_was(eager, monkeypatch, lost):
     """What this process does to it meanwhile counts nowhere, in the other process or here."""
     if lost:
-        processes._worker(0).process.kill()
-        monkeypatch.setattr(processes, "_worker", lambda number: processes._workers[number])
+        kept_processes.process_of(0).process.kill()
+        monkeypatch.setattr(processes, "process_of", lambda number: kept_processes.kept[number])
     argument = [4]
     beside = processes.Beside.begun(where_and_twice, argument, 2)
     argument[0] = 7
@@ -357,7 +360,7 @@ def test_a_process_lost_in_other_work_costs_only_that(eager):
     assert beside.result()[1] == 2
     while 0 not in beside._items:
         time.sleep(0.01)
-    processes.kill_processes()
+    kept_processes.kill_processes()
     assert beside.taken() == {0: 0.1}
     assert beside.result()[1] == 2
     assert processes.Beside.begun(where_and_twice, 3, 2).result()[1] == 6
@@ -395,7 +398,7 @@ def test_arrays_come_as_they_were_and_are_their_owners(eager, size):
     rng = np.random.default_rng(3)
     table = rng.standard_normal((size, size + 1))
     shared = {"table": table.copy(), "strided": np.asfortranarray(table)[::2, ::3]}
-    assert (table.nbytes >= processes.LARGE) == (size > 100)
+    assert (table.nbytes >= messages.LARGE) == (size > 100)
     pid, found = processes.Beside.begun(where_and_copied, shared, 2).result()
     assert pid != os.getpid()
     found["table"] += 1.0
@@ -416,9 +419,9 @@ def where_and_doubled(value):
 @pytest.mark.parametrize("lost", [False, True])
 def test_a_large_argument_is_taken_as_it_was(eager, monkeypatch, lost):
     if lost:
-        processes._worker(0).process.kill()
-        monkeypatch.setattr(processes, "_worker", lambda number: processes._workers[number])
-    argument = np.ones(2 * processes.LARGE)
+        kept_processes.process_of(0).process.kill()
+        monkeypatch.setattr(processes, "process_of", lambda number: kept_processes.kept[number])
+    argument = np.ones(2 * messages.LARGE)
     beside = processes.Beside.begun(where_and_doubled, argument, 2)
     argument[:] = 7.0
     assert np.all(beside.result()[1] == 2.0)
@@ -426,16 +429,16 @@ def test_a_large_argument_is_taken_as_it_was(eager, monkeypatch, lost):
 
 
 def test_a_message_cut_short_is_no_message():
-    message = processes._dumps({"large": np.arange(1e5), "small": 3})
+    message = messages.dumps({"large": np.arange(1e5), "small": 3})
     assert len(message) == 2
     stream = io.BytesIO()
-    processes._send(stream, message)
+    messages.send(stream, message)
     whole = stream.getvalue()
     assert len(whole) > 8e5
-    read = processes._loads(processes._receive(io.BytesIO(whole)))
+    read = messages.loads(messages.receive(io.BytesIO(whole)))
     np.testing.assert_array_equal(read["large"], np.arange(1e5))
     for cut in (0, 5, 8, 20, 30, 1000, len(whole) - 1):
-        assert processes._receive(io.BytesIO(whole[:cut])) is None
+        assert messages.receive(io.BytesIO(whole[:cut])) is None
 
 
 def begun_at(shared, item):

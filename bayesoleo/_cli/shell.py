@@ -370,7 +370,8 @@ def begin(command: str, given: Mapping[str, Any], *, search: bool) -> None:
         of = f" {campaign}" if campaign is not None else ""
         complain(f"{command}{of}: loading libraries")
     from bayesoleo._first_compilation import begin_early
-    from bayesoleo._worker_processes import load, start_ahead
+    from bayesoleo._kept_processes import load
+    from bayesoleo._worker_processes import start_ahead
 
     jobs = given.get("jobs")
     if not begin_early(jobs) and search:

@@ -18,7 +18,7 @@ import numpy as np
 
 from bayesoleo import _first_compilation as first_compilation
 from bayesoleo._compiled import is_compiled
-from bayesoleo._worker_processes import begin_elsewhere
+from bayesoleo._kept_processes import begin_elsewhere
 from bayesoleo.discovery._structure_moments import beside
 from bayesoleo.solvers._elimination import close_and_sweep
 from bayesoleo.solvers._march import is_march_compiled

@@ -12,7 +12,12 @@ import warnings
 
 import pytest
 
-from bayesoleo import _cli, _worker_processes as processes, _workflow as workflow
+from bayesoleo import (
+    _cli,
+    _kept_processes as kept_processes,
+    _worker_processes as processes,
+    _workflow as workflow,
+)
 from bayesoleo._cli import shell
 from bayesoleo.errors import DataWarning, InputError, ModelError
 
@@ -236,7 +241,7 @@ def test_libraries_load_in_both_processes_of_a_search_at_once(
 ):
     begun = []
     monkeypatch.setattr(processes, "start_ahead", lambda **given: begun.append(given))
-    monkeypatch.setattr(processes, "load", begun.append)
+    monkeypatch.setattr(kept_processes, "load", begun.append)
 
     def stopped(*_, **__):
         raise InputError("stop here")

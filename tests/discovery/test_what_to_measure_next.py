@@ -10,6 +10,8 @@ import pytest
 from fitted_states import NUMERICS, fitted
 from small_campaigns import damper, damper_campaign, oscillator_campaign
 
+import bayesoleo._kept_processes as kept_processes
+import bayesoleo._process_messages as messages
 import bayesoleo._worker_processes as processes
 from bayesoleo.discovery import _next_experiment
 from bayesoleo.discovery._assembly import Assembly
@@ -455,8 +457,8 @@ def test_another_process_judges_runs_alike(monkeypatch):
     monkeypatch.setattr(_next_experiment, "predictive_distribution", slowly)
     monkeypatch.setattr(processes._Worker, "ask", counted)
     try:
-        worker = processes._worker(0, processes.OF_A_SEARCH)
-        worker.ask(processes._dumps((None, None, None)))  # it answers once it has begun
+        worker = kept_processes.process_of(0, processes.OF_A_SEARCH)
+        worker.ask(messages.dumps((None, None, None)))  # it answers once it has begun
         for jobs in (2, 1):
             asked.clear()
             rivals = [Rival("decay", state.fit)]
@@ -464,7 +466,7 @@ def test_another_process_judges_runs_alike(monkeypatch):
             told.append([(t.like, t.change, t.label, t.information) for t in found.trials])
             assert ("value" in asked) is (jobs == 2)
     finally:
-        processes.end_processes()
+        kept_processes.end_processes()
     assert told[0] == told[1]
 
 

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from small_campaigns import damper, damper_campaign, with_friction
 
+import bayesoleo._kept_processes as kept_processes
+import bayesoleo._process_messages as messages
 import bayesoleo._worker_processes as processes
 from bayesoleo.discovery._assembly import assign
 from bayesoleo.discovery._fit import fit_model
@@ -30,13 +32,14 @@ def eager(monkeypatch):
             thread.join(60)
 
     monkeypatch.setattr(processes.StandingCall, "begin", waited)
-    processes._worker(0).ask(processes._dumps((None, None, None)))  # it answers once it has begun
+    # It answers once it has begun.
+    kept_processes.process_of(0).ask(messages.dumps((None, None, None)))
 
 
 @pytest.fixture(scope="module", autouse=True)
 def ended():
     yield
-    processes.end_processes()
+    kept_processes.end_processes()
 
 
 @pytest.fixture(scope="module")
@@ -93,9 +96,9 @@ def test_a_lost_process_costs_nothing_but_time(fit, eager, known):
     expected, _ = density_of(fit, 1)(phi)
     shared = ready(SharedDensity(density_of(fit)), phi)
     try:
-        processes._workers[0].process.kill()
+        kept_processes.kept[0].process.kill()
         if known:
-            processes._workers[0].process.wait()
+            kept_processes.kept[0].process.wait()
         np.testing.assert_array_equal(shared(phi)[0], expected)
         assert shared._rows.others == 0
         np.testing.assert_array_equal(shared(phi)[0], expected)
@@ -128,12 +131,12 @@ def test_draws_do_not_depend_on_processes(fit, eager, monkeypatch):
 
 
 def test_short_sampling_starts_no_process(fit, monkeypatch):
-    processes.end_processes()
+    kept_processes.end_processes()
     monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
     shared = SharedDensity(density_of(fit))
     shared(near(fit))
     shared.end()
-    assert not processes._workers
+    assert not kept_processes.kept
 
 
 def test_an_error_elsewhere_is_raised_here(eager):

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import bayesoleo._kept_processes as kept_processes
+import bayesoleo._process_messages as messages
 import bayesoleo._worker_processes as processes
 from bayesoleo import _schema as schema
 from bayesoleo._report import sections
@@ -379,13 +381,13 @@ def test_shortened_paths_are_the_same_but_for_a_hundredth_of_a_point():
 def test_figures_of_another_process_are_the_same(oleo, page, monkeypatch):
     monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
     monkeypatch.setattr(processes, "WORTH_ASKING", 0.0)
-    processes._worker(0).ask(processes._dumps((None, None, None)))
+    kept_processes.process_of(0).ask(messages.dumps((None, None, None)))
     try:
         with matplotlib.rc_context({"axes.titleweight": "bold"}):
             mixed = render_report(oleo)
         assert render_report(oleo) == page
     finally:
-        processes.end_processes()
+        kept_processes.end_processes()
     monkeypatch.setenv("BAYESOLEO_PROCESSES", "0")
     with matplotlib.rc_context({"axes.titleweight": "bold"}):
         assert render_report(oleo) == mixed != page

@@ -1,0 +1,250 @@
+"""Processes that are kept for work, what they do, and a process that nobody waits for.
+
+They are started by a command: they do not run the user's script again. A process that nobody asks
+for a while ends, and so do all when the one that started them does.
+"""
+
+from __future__ import annotations
+
+import atexit
+import gc
+import importlib
+import json
+import os
+import select
+import subprocess
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any, BinaryIO, cast
+
+import bayesoleo._parallel as parallel
+from bayesoleo._process_messages import Message, dumps, loads, receive, send
+
+#: Seconds without work after which a process ends.
+IDLE = 120.0
+#: It finds modules where its parent finds them, and does not run the user's script again.
+_CHILD = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]);"
+    " from bayesoleo._kept_processes import serve; serve(sys.argv[2:])"
+)
+READY, VALUE, ERROR, UNREADABLE = "ready", "value", "error", "unreadable"
+
+
+class LostError(Exception):
+    """A process ended, or cannot read what it was sent."""
+
+
+def usable() -> bool:
+    """Whether processes may be started: not by a worker, nor where the user forbids it."""
+    asked = os.environ.get("BAYESOLEO_PROCESSES", "")
+    return asked != "0" and bool(sys.executable)
+
+
+kept: dict[int, Worker] = {}
+
+
+class Worker:
+    """A process that waits for work, and the pipes to it."""
+
+    def __init__(self, modules: Sequence[str] = ()) -> None:
+        environment = os.environ | dict.fromkeys(parallel.ONE_THREAD, "1")
+        command = [sys.executable, "-P", "-c", _CHILD, _paths(), *modules]
+        self.process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=environment,
+        )
+
+    def ask(self, message: Message, known: Sequence[Any] = ()) -> tuple[str, Any]:
+        """Send a message and wait for the answer: its kind and its content."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        try:
+            send(cast(BinaryIO, self.process.stdin), message)
+            answer = receive(cast(BinaryIO, self.process.stdout))
+        except (OSError, ValueError) as error:
+            raise LostError from error
+        if answer is None:
+            raise LostError
+        try:
+            kind, value = loads(answer, known)
+        except Exception as error:
+            raise LostError from error
+        if kind == UNREADABLE:
+            raise LostError
+        return kind, value
+
+    def end(self) -> None:
+        """End the process, and close the pipes to it."""
+        self.process.kill()
+        for pipe in (self.process.stdin, self.process.stdout):
+            if pipe is not None:
+                with suppress(OSError):
+                    pipe.close()
+        self.process.wait()
+
+
+def _paths() -> str:
+    """Where modules are found; an import passes over what is no text."""
+    return json.dumps([one for one in sys.path if isinstance(one, str)])
+
+
+def process_of(number: int, modules: Sequence[str] = ()) -> Worker:
+    """The process of a number, started where there is none or it has ended."""
+    known = kept.get(number)
+    if known is not None and known.process.poll() is not None:
+        forget(number)
+        known = None
+    if known is None:
+        try:
+            known = kept[number] = Worker(modules)
+        except OSError as error:  # no memory, or too many processes
+            raise LostError from error
+    return known
+
+
+def forget(number: int) -> None:
+    worker = kept.pop(number, None)
+    if worker is not None:
+        worker.end()
+
+
+def kill_processes() -> None:
+    """Kill all processes that are kept; whoever waits for one finds it lost."""
+    for worker in list(kept.values()):
+        worker.process.kill()
+
+
+@atexit.register
+def end_processes() -> None:
+    """End all processes that are kept."""
+    for number in list(kept):
+        forget(number)
+
+
+if hasattr(os, "register_at_fork"):  # pipes belong to the process that made them
+    os.register_at_fork(after_in_child=kept.clear)
+
+
+def begin_elsewhere(module: str, function: str) -> bool:
+    """Call a function without arguments in a process that nobody waits for; whether one was begun.
+
+    It is killed where this process ends before it does.
+    """
+    if not usable():
+        return False
+    code = f"import json, sys; sys.path[:] = json.loads(sys.argv[1]); import {module} as m"
+    with suppress(OSError):
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-c", f"{code}; m.{function}()", _paths()],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        atexit.register(_end, process)
+        return True
+    return False
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
+
+
+def sent(value: Any, known: Sequence[Any] = ()) -> Message:
+    """A message for a process; what cannot be sent is done by whoever asks."""
+    try:
+        return dumps(value, known)
+    except Exception as error:
+        raise LostError from error
+
+
+def load(modules: Sequence[str]) -> None:
+    """Load modules in a process of this package's own, which needs them until it ends.
+
+    There is no garbage in them: half a million objects are kept out of all searches for it.
+
+    Parameters
+    ----------
+    modules : sequence of str
+        Where all are loaded, nothing is done.
+    """
+    if all(name in sys.modules for name in modules):
+        return
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        for name in modules:
+            importlib.import_module(name)
+    finally:
+        gc.freeze()
+        if was_on:
+            gc.enable()
+
+
+def serve(modules: Sequence[str]) -> None:
+    """In another process: do what comes, until nothing comes any more.
+
+    Parameters
+    ----------
+    modules : sequence of str
+        To be loaded before anything comes.
+    """
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    parallel.limit_threads(1)
+    source, target = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what is printed must not get among the messages
+    load(modules)
+    function, shared, objects = cast(Any, None), None, cast(Sequence[Any], ())
+    while _waits(source):
+        message = receive(source)
+        if message is None:
+            return
+        try:
+            content = loads(message, objects)
+        except Exception as error:  # a module that only the parent has
+            send(target, dumps((UNREADABLE, str(error))))
+            continue
+        if len(content) == 3:
+            function, shared, known = content
+            objects = () if known is None else known(shared)
+            send(target, dumps((READY, None)))
+            continue
+        _, item = content
+        try:
+            answer = _answer(function(shared, item), objects)
+        except MemoryError as error:  # there is more where this one's memory is not needed
+            answer = dumps((UNREADABLE, str(error)))
+        except Exception as error:
+            answer = _of_error(error)
+        send(target, answer)
+
+
+def _answer(value: Any, known: Sequence[Any]) -> Message:
+    """A result for the parent; where it cannot be sent, the parent computes it."""
+    try:
+        return dumps((VALUE, value), known)
+    except Exception as error:
+        return dumps((UNREADABLE, str(error)))
+
+
+def _waits(source: BinaryIO) -> bool:
+    """Whether something comes before it has been idle for too long."""
+    if sys.platform == "win32":
+        return True  # pipes cannot be waited for
+    return bool(select.select([source], [], [], IDLE)[0])
+
+
+def _of_error(error: Exception) -> Message:
+    """An error for the parent; where it cannot be sent, the parent meets it by itself."""
+    try:
+        content = dumps((ERROR, error))
+        loads(content)
+    except Exception:
+        return dumps((UNREADABLE, str(error)))
+    return content
