@@ -272,20 +272,22 @@ def _of_run(fit: ModelFit, r: int, run: RunPredictor, p: Array) -> Array | Statu
     """Derivatives of one run's outputs, shape (L, ny, na, N)."""
     run.motions = fit.predictor.runs[r].known_motions()
     run.watched = False  # at the null nothing has moved
-    known = run.evaluate_on(fit.predictor.runs[r], p)
-    if known is not None and (known.status == Status.CONVERGED.value).all():
-        samples = known
-    elif len(p) == 1:
+    samples = run.evaluate_on(fit.predictor.runs[r], p)
+    if samples is not None and not (samples.status == Status.CONVERGED.value).all():
+        samples = None
+    if samples is None and run.motions.keys() < set(run.kernels.derived.dofs):
+        samples = run.follow(p)
+    if samples is None and len(p) == 1:
         samples = run.evaluate(p[0])
-    else:
+    elif samples is None:
         status = _anchored(run, p)
         if status is not Status.CONVERGED:
             return status
         samples = run.predict(p, derivatives=True)
-        solved = samples.status == Status.CONVERGED.value
-        if solved.any() and not solved.all():
-            return _of_two_parts(fit, r, run, p, solved)
-    if (samples.status != Status.CONVERGED.value).any() or samples.y_p is None:
+    solved = samples.status == Status.CONVERGED.value
+    if solved.any() and not solved.all():
+        return _of_two_parts(fit, r, run, p, solved)
+    if not solved.all() or samples.y_p is None:
         return Status(int(samples.status.max()))
     constants = run.kernels.derived.constants
     own = [k for k, name in enumerate(constants) if name in fit.model.parameters]

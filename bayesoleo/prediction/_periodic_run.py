@@ -50,6 +50,9 @@ FEW_STEPS = 1024
 #: undamped ones leave one in 100. After 4 damped ones a density takes 0.86 times as long as after
 #: 10.
 FIRST_DAMPED, WHOLE_STEPS, DAMPED_STEPS = 4, 200, 40
+#: Whole steps by which states are found that follow a known motion, and the part of its norm by
+#: which a motion may differ from the known one: by that of another mesh, and not another motion.
+FOLLOWING, KEPT = 40, 1e-3
 #: Threads share a run.
 _COUNTING = threading.Lock()
 
@@ -485,6 +488,55 @@ class RunPredictor:
         x = np.repeat(motion.x[None], len(p), axis=0)
         status = np.full(len(p), Status.CONVERGED.value, dtype=np.int64)
         return self._at_samples(p, x, x_p, status, derivatives=True)
+
+    def follow(self, p: Array) -> PredictedSamples | None:
+        """Outputs with derivatives where states follow :attr:`motions`, on which they do not act.
+
+        All start from guesses, and take whole steps. What lags behind a motion, or is dragged along
+        by it, is found in a few of these; with a residual that has to fall the iteration is caught
+        between the kinks of a clearance, and a solution for other constants leads nowhere. The
+        first solution becomes the anchor.
+
+        Parameters
+        ----------
+        p : ndarray, shape (L, np)
+            Constants at which the states act on nothing.
+
+        Returns
+        -------
+        PredictedSamples or None
+            Without a solution where the motion would be another one. None where no motion is known,
+            or there is no solution at all.
+        """
+        if type(self) is not RunPredictor or not self.motions:
+            return None
+        guesses = np.concatenate([self.guess(row) for row in p])
+        solution = solve_periodic(
+            self.boundary, p, guesses, max_iterations=FOLLOWING, monotone=False, exchange=False
+        )
+        solution, x_p, monodromy = sensitivities(self.boundary, p, solution)
+        status = solution.status.copy()
+        for lane in np.flatnonzero(status == Status.CONVERGED.value):
+            if not self._is_known(solution.x[lane], guesses[lane]):
+                status[lane] = Status.NO_CONVERGENCE.value
+        solved = np.flatnonzero(status == Status.CONVERGED.value)
+        if not solved.size:
+            return None
+        k = int(solved[0])
+        moved = np.ascontiguousarray(np.moveaxis(x_p[k], 2, 0))
+        self.anchor = Anchor(p[k].copy(), solution.x[k], moved, monodromy[k])
+        return self._at_samples(p, solution.x, x_p, status, derivatives=True)
+
+    def _is_known(self, x: Array, guess: Array) -> bool:
+        """Whether dofs whose motions are known move as they were guessed to."""
+        nodes, derived = np.arange(self.steps) / self.steps, self.kernels.derived
+        starts = np.cumsum([0, *(order + 1 for order in derived.orders)])
+        known = [
+            int(a) for dof, a in zip(derived.dofs, starts, strict=False) if dof in self.motions
+        ]
+        expected = self.rows(guess, nodes)[known]
+        away = np.linalg.norm(self.rows(x, nodes)[known] - expected, axis=1)
+        return bool(np.all(away <= KEPT * np.linalg.norm(expected, axis=1)))
 
     def _moves_like(self, other: RunPredictor) -> bool:
         """Whether unknowns mean the same: one mesh, and the same states in the same order."""
