@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -16,6 +17,7 @@ from bayesoleo.model._expressions import COSINE, SINE, WITHIN
 from bayesoleo.model._kernels import kernels
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._band_limited import Smoothed, declared
+from bayesoleo.prediction._kept_by_record import KeptByRecord
 from bayesoleo.prediction._records import Harmonics, Record, Signal
 from bayesoleo.solvers._initial_value import Dynamics
 from bayesoleo.solvers._switching import InputSignal, periodic_signal
@@ -23,6 +25,8 @@ from bayesoleo.solvers._switching import InputSignal, periodic_signal
 #: Rows computed before, by grid, channel, derivative and the highest that the model takes; models
 #: of the same run share them.
 RowCache = dict[tuple[str, str, int, int], Array]
+#: Rows of all models of periodic runs, up to so many bytes.
+_rows = KeptByRecord(3e8)
 #: With more harmonics than these their sum costs an integrator more than all else: a rough motion
 #: takes it from cubic pieces, so many in a cycle of the highest one (wrong by 2e-7 of it).
 MANY_HARMONICS, PIECES_PER_CYCLE = 32, 64
@@ -180,7 +184,7 @@ def input_rows(
     phase : ndarray, shape (N,)
         Cycles since the first sample; of a transient, parts of its length.
     grid : str
-        Names ``phase`` in the cache.
+        Names ``phase`` in the cache, of a periodic run also among all its models.
     cache : dict, optional
         Taken from and added to.
     """
@@ -193,10 +197,16 @@ def input_rows(
         else:
             key = (grid, channel, derivative, highest[channel])
             if key not in known:
-                item = signal_of(record, channel, highest[channel])
-                known[key] = item.evaluate(phase, record.rate, derivative)
+                make = partial(_row, record, channel, highest[channel], derivative, phase)
+                # A mesh of a transient is its model's own.
+                shared = bool(grid) and record.periodic
+                known[key] = _rows.of(record, key, make) if shared else make()
             table[k] = known[key]
     return table
+
+
+def _row(record: Record, channel: str, highest: int, derivative: int, phase: Array) -> Array:
+    return signal_of(record, channel, highest).evaluate(phase, record.rate, derivative)
 
 
 def signal_of_transient(record: Record, rows: tuple[tuple[str, int], ...]) -> InputSignal:

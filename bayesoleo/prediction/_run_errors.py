@@ -13,10 +13,9 @@ discretisation error is estimated once, at the point estimate.
 from __future__ import annotations
 
 import threading
-import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Protocol, cast
 
 import numpy as np
@@ -30,6 +29,7 @@ from bayesoleo.prediction._inputs import (
     signal_of,
     signal_of_rows,
 )
+from bayesoleo.prediction._kept_by_record import KeptByRecord
 from bayesoleo.prediction._periodic_run import RunPredictor
 from bayesoleo.prediction._periodic_solver import SolvedRun
 from bayesoleo.prediction._records import TABLE, Harmonics, Record
@@ -198,7 +198,7 @@ class _InputChanges:
             derivatives = tuple(orders.values())
             block: _Block
             if record.periodic:
-                block = _Known(_harmonics.of(record, channel, highest[channel], derivatives, phase))
+                block = _Known(_changes_of(record, channel, highest[channel], derivatives, phase))
             else:
                 curve = cast(Smoothed, signal_of(record, channel, highest[channel]))
                 size, rate = record.time.size, record.rate
@@ -365,50 +365,22 @@ class _Draws:
 _errors = _Draws(MOST_KEPT)
 
 
-class _HarmonicChanges:
-    """Changes by the harmonics of runs, those asked for last: each model of a run asks for them
-    again, and of a broadband input they take as long as the states. They go with the run."""
+#: Of a broadband input changes by its harmonics take as long as the states of a model, and the
+#: input at all points at which equations are looked at takes as long as the look.
+_of_records = KeptByRecord(MOST_KEPT)
 
-    def __init__(self, most: float):
-        # A run may go while this one holds it: then its thread asks again.
-        self.most, self.lock = most, threading.RLock()
-        self.kept: OrderedDict[tuple[int, object], Array] = OrderedDict()
-        self.runs: dict[int, weakref.ref[Record]] = {}
 
-    def of(
-        self,
-        record: Record,
-        channel: str,
-        highest: int,
-        derivatives: tuple[int, ...],
-        phase: Array,
-    ) -> Array:
-        """See :func:`_harmonic_changes`; not to be written to."""
-        key = id(record), (channel, highest, derivatives, phase.tobytes(), MOST_LINES)
-        with self.lock:
-            if key in self.kept:
-                self.kept.move_to_end(key)
-                return self.kept[key]
+def _changes_of(
+    record: Record, channel: str, highest: int, derivatives: tuple[int, ...], phase: Array
+) -> Array:
+    """See :func:`_harmonic_changes`; not to be written to."""
+
+    def make() -> Array:
         item = harmonics_of(record, channel).for_derivative(highest)
-        found = _harmonic_changes(item, record.frequency, derivatives, phase)
-        found.flags.writeable = False
-        with self.lock:
-            if key[0] not in self.runs:
-                self.runs[key[0]] = weakref.ref(record, partial(self._forget, key[0]))
-            self.kept[key] = found
-            while len(self.kept) > 1 and sum(x.nbytes for x in self.kept.values()) > self.most:
-                self.kept.popitem(last=False)
-        return found
+        return _harmonic_changes(item, record.frequency, derivatives, phase)
 
-    def _forget(self, number: int, _: object) -> None:
-        """Of a run that is no more, before another one has its number."""
-        with self.lock:
-            self.runs.pop(number, None)
-            for key in [key for key in self.kept if key[0] == number]:
-                del self.kept[key]
-
-
-_harmonics = _HarmonicChanges(MOST_KEPT)
+    key = channel, highest, derivatives, phase.tobytes(), MOST_LINES
+    return _of_records.of(record, key, make)
 
 
 @lru_cache(maxsize=4)
@@ -546,7 +518,9 @@ def _inputs_at(run: RunPredictor) -> Callable[[Array], Array]:
     if not record.periodic:
         return lambda position: input_rows(record, rows, position)
     signal = signal_of_rows(record, rows)
-    return lambda phase: evaluate(signal, phase * run.period)
+    return lambda phase: _of_records.of(
+        record, (rows, phase.tobytes()), lambda: evaluate(signal, phase * run.period)
+    )
 
 
 def outputs_of(run: RunPredictor, estimate: ErrorEstimate) -> Array | None:

@@ -1,7 +1,7 @@
 """A measured channel as an input at another one's harmonics: what a frame's compliance needs."""
 
-import gc
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from multisines import multisine_campaign, resonance
 from bayesoleo.errors import CampaignError
 from bayesoleo.model import Dof, Model, Output, Parameter
 from bayesoleo.model._expressions import within
-from bayesoleo.prediction import _run_errors
+from bayesoleo.prediction import _inputs, _run_errors
 from bayesoleo.prediction._band_limited import declared
 from bayesoleo.prediction._inputs import harmonics_of, input_rows, signal_of
 from bayesoleo.prediction._predictor import Predictor
@@ -171,7 +171,6 @@ def test_few_harmonics_keep_a_column_each():
 def test_changes_by_harmonics_are_kept_for_the_next_model_and_not_for_another_run(
     record, monkeypatch
 ):
-    kept = _run_errors._HarmonicChanges(1e6)
     phase, turned = np.linspace(0, 1, 9), np.linspace(0, 2, 9)
     asked = [("force", 1, (0, 1), phase), ("force", 1, (0, 1), turned), ("force", 1, (1,), phase)]
     asked += [("displacement", 1, (0, 1), phase)]
@@ -180,28 +179,39 @@ def test_changes_by_harmonics_are_kept_for_the_next_model_and_not_for_another_ru
         for channel, highest, derivatives, at in asked:
             item = harmonics_of(other, channel).for_derivative(highest)
             rightly = _run_errors._harmonic_changes(item, other.frequency, derivatives, at)
-            now = kept.of(other, channel, highest, derivatives, at)
+            now = _run_errors._changes_of(other, channel, highest, derivatives, at)
             np.testing.assert_array_equal(now, rightly)
             found[len(found)] = now
     monkeypatch.setattr(_run_errors, "_harmonic_changes", None)  # nothing is made again
-    assert kept.of(record, *asked[0]) is found[0]
-    with pytest.raises(ValueError, match="read-only"):
-        found[0][0] = 0.0
+    assert _run_errors._changes_of(record, *asked[0]) is found[0]
 
 
-def test_changes_by_harmonics_go_with_their_run(record):
-    kept, phase = _run_errors._HarmonicChanges(1e6), np.linspace(0, 1, 9)
-    other = replace(record, frequency=2.0)
-    for one in (record, other):
-        kept.of(one, "force", 1, (0, 1), phase)
-    assert len(kept.kept) == len(kept.runs) == 2
-    del one, other
-    gc.collect()
-    assert len(kept.kept) == len(kept.runs) == 1
+@pytest.mark.parametrize("rows", [(("force", 0), ("force", 1)), (("displacement", 2),)])
+def test_inputs_at_looks_are_made_once_for_all_models_of_a_run(record, monkeypatch, rows):
+    def looked(of):
+        run = SimpleNamespace(
+            record=of,
+            kernels=SimpleNamespace(derived=SimpleNamespace(inputs=rows)),
+            period=1.0 / of.frequency,
+        )
+        return _run_errors._inputs_at(run)
+
+    phase = np.linspace(0.0, 1.0, 50)
+    for other in (record, replace(record, frequency=2.0 * record.frequency)):
+        np.testing.assert_allclose(
+            looked(other)(phase), input_rows(other, rows, phase), rtol=1e-9, atol=1e-9
+        )
+        np.testing.assert_allclose(
+            looked(other)(0.5 * phase), input_rows(other, rows, 0.5 * phase), rtol=1e-9, atol=1e-9
+        )
+    monkeypatch.setattr(_run_errors, "evaluate", None)  # nothing is made again
+    assert looked(record)(phase).shape == (len(rows), 50)
 
 
-def test_no_more_changes_are_kept_than_fit(record):
-    kept = _run_errors._HarmonicChanges(1.0)
-    for size in (5, 6, 7):
-        kept.of(record, "force", 0, (0,), np.linspace(0, 1, size))
-    assert len(kept.kept) == 1  # the last one is kept whatever its size
+def test_models_of_a_periodic_run_share_its_rows_on_a_grid(record, monkeypatch):
+    rows, phase = (("force", 1),), np.linspace(0.0, 1.0, 30)
+    first = input_rows(record, rows, phase, "a grid", {})
+    other = replace(record, frequency=2.0 * record.frequency)
+    np.testing.assert_allclose(input_rows(other, rows, phase, "a grid", {}), 2.0 * first)
+    monkeypatch.setattr(_inputs, "signal_of", None)  # nothing is made again
+    np.testing.assert_array_equal(input_rows(record, rows, phase, "a grid"), first)
