@@ -29,7 +29,7 @@ from numba.extending import intrinsic
 
 from bayesoleo._compiled_sources import stamp_of
 from bayesoleo._machine_code import COMPILING, address_of, sealed, unsealed, write_durably
-from bayesoleo._one_compilation import in_one_process
+from bayesoleo._one_compilation import in_one_process, is_elsewhere
 from bayesoleo._types import Array, Integers
 
 #: Their annotations lack too much for them to be called in checked code.
@@ -144,6 +144,15 @@ class _CheckedCache(_FunctionCache):  # type: ignore[misc]
             super()._save_overload(signature, data)
 
 
+def is_compiled_elsewhere(function: Any) -> bool:
+    """Whether another process compiles a function of :func:`cached` now."""
+    return is_elsewhere(_name_of(function))
+
+
+def _name_of(function: Any) -> str:
+    return f"{function.__module__}.{function.__name__}"
+
+
 #: Level of LLVM's optimisation. At the usual one, three, the same functions take longer to compile
 #: and are no faster: their loops over points are in kernels, which are compiled apart.
 LEVEL = 1
@@ -160,8 +169,7 @@ def _compiler_of(dispatcher: Any) -> Callable[[Any], Any]:
         # Numba reads the level while it compiles, which it does under this lock.
         with global_compiler_lock, ExitStack() as stack:
             if not _compiling and not dispatcher._cache.holds(signature, dispatcher.targetctx):
-                name = f"{function.__module__}.{function.__name__}"
-                stack.enter_context(in_one_process(name, _tell))
+                stack.enter_context(in_one_process(_name_of(function), _tell))
             before = _config.OPT
             _config.OPT = type(before)(min(before, LEVEL))
             _compiling.append(function.__name__)

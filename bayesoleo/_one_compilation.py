@@ -13,6 +13,8 @@ from bayesoleo._file_locks import FAR, try_lock
 
 #: Seconds that a process waits for another one that compiles the same function, and between looks.
 PATIENCE, LOOK = 120.0, 0.02
+#: A file with a byte for each function.
+LOCKS = "compiling.lock"
 
 
 @contextmanager
@@ -33,6 +35,18 @@ def in_one_process(name: str, waiting: Callable[[], object]) -> Iterator[None]:
             file.close()
 
 
+def is_elsewhere(name: str) -> bool:
+    """Whether another process compiles a function of that name now. Not to be asked while this one
+    compiles: its locks end where the file is closed."""
+    with suppress(OSError), (user_cache() / LOCKS).open("ab") as file:
+        return not try_lock(file, _byte(name))
+    return False
+
+
+def _byte(name: str) -> int:
+    return zlib.crc32(name.encode()) % FAR
+
+
 def _lock_of(name: str, waiting: Callable[[], object]) -> IO[bytes] | None:
     """A file that is locked for a function, unless another process holds it for too long.
 
@@ -41,8 +55,8 @@ def _lock_of(name: str, waiting: Callable[[], object]) -> IO[bytes] | None:
     with suppress(OSError):
         folder = user_cache()
         folder.mkdir(parents=True, exist_ok=True)
-        file = (folder / "compiling.lock").open("ab")
-        end, byte = time.monotonic() + PATIENCE, zlib.crc32(name.encode()) % FAR
+        file = (folder / LOCKS).open("ab")
+        end, byte = time.monotonic() + PATIENCE, _byte(name)
         try:
             while not try_lock(file, byte) and time.monotonic() < end:
                 waiting()

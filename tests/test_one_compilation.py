@@ -46,6 +46,19 @@ def entered(name: str) -> float:
         return time.monotonic() - begin
 
 
+def test_what_another_process_compiles_is_seen_while_it_does(holder):
+    assert one.is_elsewhere("f")
+    assert not one.is_elsewhere("g")
+    holder.kill()
+    holder.wait()
+    assert not one.is_elsewhere("f")
+
+
+def test_where_there_is_no_cache_nothing_is_compiled_elsewhere(tmp_path, monkeypatch):
+    monkeypatch.setenv("BAYESOLEO_CACHE", str(tmp_path / "not made"))
+    assert not one.is_elsewhere("f")
+
+
 @pytest.mark.parametrize("end", ["done", "killed"])
 def test_one_waits_until_the_other_is_done_or_gone(holder, end):
     wait = 0.5

@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bayesoleo import _first_compilation as first_compilation
-from bayesoleo._compiled import is_compiled
+from bayesoleo._compiled import is_compiled, is_compiled_elsewhere
 from bayesoleo._kept_processes import begin_elsewhere
 from bayesoleo.discovery._structure_moments import beside
 from bayesoleo.solvers._elimination import close_and_sweep
 from bayesoleo.solvers._march import is_march_compiled
 from bayesoleo.solvers._periodic_newton import compile_iteration
+from bayesoleo.solvers._swept_columns import compile_columns, solve_columns
 
 if TYPE_CHECKING:
     from bayesoleo.prediction._periodic_run import RunPredictor
@@ -75,11 +76,16 @@ def compile_shooting() -> None:
     """Find a motion by shooting, in a process that gives way to others."""
     from bayesoleo.prediction._starts import solve_from_shot
 
-    with suppress(AttributeError, OSError):  # a system without priorities
-        os.nice(NICE)
+    _give_way()
     run = _oscillator()
     p = _constants(run)[0]
     solve_from_shot(run.model, run.kernels, run.record, run.boundary, p, run.guess(p))
+
+
+def _give_way() -> None:
+    """Let the processes that a user waits for go first."""
+    with suppress(AttributeError, OSError):  # a system without priorities
+        os.nice(NICE)
 
 
 def _is_done() -> bool:
@@ -90,17 +96,19 @@ def _is_done() -> bool:
 def compile_ahead() -> None:
     """Compile in a process of its own what takes longest, in the order of need.
 
-    This file imports no model, whose libraries take seconds to load: the first function, which the
-    caller waits for longest, does without.
+    What the caller waits for needs no model: this file loads no libraries of one, which take
+    seconds.
     """
     if _is_done():
         first_compilation.leave_mark()
         return
     compile_iteration()
-    run = _oscillator()
-    run.set_anchor(_constants(run)[0])
+    # Where the caller has come to the elimination first, to wait for it would be time lost.
+    if not is_compiled_elsewhere(solve_columns):
+        compile_columns()
+    _give_way()  # what follows is needed once the search has come to structures
     _compile_evidence()
-    _compile_batches(run)
+    _compile_batches()
     first_compilation.leave_mark()
 
 
@@ -145,10 +153,12 @@ def _compile_evidence() -> None:
     compile_evidence()
 
 
-def _compile_batches(run: RunPredictor) -> None:
+def _compile_batches() -> None:
     """The iteration for candidates whose equations are not compiled."""
     from bayesoleo.solvers._periodic import solve_in_batch
 
+    run = _oscillator()
+    run.set_anchor(_constants(run)[0])
     assert run.anchor is not None
     start = run.anchor.predict(np.zeros((1, len(run.active))))
     solve_in_batch(run.boundary, _constants(run), start, most=1)

@@ -16,12 +16,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numba import config
 
-from bayesoleo._compiled import BLOCK, inner, jit
+from bayesoleo._compiled import BLOCK, inner, jit, record
 from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.solvers._blocked_collocation import columns_of
 from bayesoleo.solvers._unrolled_collocation import REACH, WIDTH
@@ -343,6 +343,12 @@ def _shapes(sizes: Sizes) -> Work:
         before=(2 * d,),
         constants=(max(sizes.constants, 1),),
     )
+
+
+def nothing[T: tuple[Any, ...]](kind: type[T]) -> T:
+    """A record of zeros, to compile what takes one without a problem."""
+    named = cast(Any, kind)
+    return record(cast(T, named(*[0] * len(named._fields))))
 
 
 class Options(NamedTuple):

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numba import carray
@@ -31,7 +31,6 @@ from bayesoleo._compiled import (
     jit,
     numbers,
     pointer,
-    record,
 )
 from bayesoleo._types import Array, Integers
 from bayesoleo.solvers._elimination import LARGEST_GROWTH, close as solve_closure, close_balanced
@@ -45,6 +44,7 @@ from bayesoleo.solvers._period_arrangement import (
     SweepKernels,
     SweepLayout,
     Work,
+    nothing,
     total,
     unit,
 )
@@ -297,15 +297,10 @@ def compile_iteration() -> None:
     none: no model is needed for it, nor the libraries of one."""
     status = np.empty(0, dtype=np.int64)
     solve_lanes(
-        _nothing(SweepKernels), _nothing(Sizes), _nothing(Sweep), _nothing(Work),
+        nothing(SweepKernels), nothing(Sizes), nothing(Sweep), nothing(Work),
         Options(0, True, False), np.empty((0, 1)), np.empty((0, 1, 1)), NO_LINE, status,
         status.copy(),
     )  # fmt: skip
-
-
-def _nothing[T: tuple[Any, ...]](kind: type[T]) -> T:
-    named = cast(Any, kind)
-    return record(cast(T, named(*[0] * len(named._fields))))
 
 
 @inner

@@ -16,7 +16,7 @@ from numba import carray
 from bayesoleo._compiled import BLOCK, after, inner, integers, jit, numbers, pointer, record
 from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.solvers import _period_arrangement as arrangement
-from bayesoleo.solvers._period_arrangement import Sizes, Sweep, SweepKernels, Work
+from bayesoleo.solvers._period_arrangement import Sizes, Sweep, SweepKernels, Work, nothing
 from bayesoleo.solvers._periodic_newton import (
     CONVERGED,
     as_swept,
@@ -150,6 +150,16 @@ def solve_columns(
             update(pieces.update, sizes, sweep, work)
             to = pointer(dx, lane * solution * given.columns)
             _in_column(sizes, sweep, work, given, column, to)
+
+
+def compile_columns() -> None:
+    """Compile the elimination for what it is called with, or load it, as
+    :func:`~bayesoleo.solvers._periodic_newton.compile_iteration` does."""
+    solve_columns(
+        nothing(SweepKernels), nothing(Sizes), nothing(Sweep), nothing(Work), False,
+        Given(0, 0, 0, 0, 0, 0), np.empty(0, dtype=np.int64), np.empty((0, 1, 1, 1)),
+        np.empty((0, 1, 1)), np.empty(0, dtype=np.bool_),
+    )  # fmt: skip
 
 
 @inner

@@ -79,9 +79,10 @@ def test_two_processes_compile_everything_once(tmp_path):
     for module, name in (*LONG, *SHORT):
         own = [file for file in compiled(tmp_path) if file.startswith(f"{module}.{name}-")]
         assert len(own) == 1, name
-    # Without a problem it was compiled for what a problem calls it with.
-    iteration = [file.name for file in tmp_path.rglob("*.nbc") if ".solve_lanes-" in file.name]
-    assert len(iteration) == 1
+    # Without a problem they were compiled for what a problem calls them with.
+    for _, name in LONG[:2]:
+        made = [file.name for file in tmp_path.rglob("*.nbc") if f".{name}-" in file.name]
+        assert len(made) == 1
     assert list(tmp_path.glob("compiled-*"))
     before = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.nb[ic]")}
     run(
@@ -89,6 +90,23 @@ def test_two_processes_compile_everything_once(tmp_path):
         tmp_path,
     )
     assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.nb[ic]")} == before
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_what_the_caller_compiles_is_left_to_it(monkeypatch, tmp_path, elsewhere):
+    """Its own process goes on with what comes next, at low priority, and says when all is done."""
+    done = []
+    monkeypatch.setenv("BAYESOLEO_CACHE", str(tmp_path))
+    monkeypatch.setattr(ahead, "is_compiled", lambda _: False)
+    monkeypatch.setattr(ahead, "is_compiled_elsewhere", lambda _: elsewhere)
+    for name in ("compile_iteration", "compile_columns", "_compile_evidence", "_compile_batches"):
+        monkeypatch.setattr(ahead, name, lambda name=name: done.append(name))
+    monkeypatch.setattr(ahead, "_give_way", lambda: done.append("gives way"))
+    ahead.compile_ahead()
+    columns = [] if elsewhere else ["compile_columns"]
+    later = ["gives way", "_compile_evidence", "_compile_batches"]
+    assert done == ["compile_iteration", *columns, *later]
+    assert list(tmp_path.glob("compiled-*"))
 
 
 @pytest.mark.parametrize(
