@@ -270,13 +270,15 @@ def _constants(
 
 def _of_run(fit: ModelFit, r: int, run: RunPredictor, p: Array) -> Array | Status:
     """Derivatives of one run's outputs, shape (L, ny, na, N)."""
-    run.motions = fit.predictor.runs[r].known_motions()
+    present = fit.predictor.runs[r]
+    run.motions = present.known_motions()
     run.watched = False  # at the null nothing has moved
-    samples = run.evaluate_on(fit.predictor.runs[r], p)
+    samples = run.evaluate_on(present, p)
     if samples is not None and not (samples.status == Status.CONVERGED.value).all():
         samples = None
-    if samples is None and run.motions.keys() < set(run.kernels.derived.dofs):
-        samples = run.follow(p)
+    known, dofs = run.motions.keys(), set(run.kernels.derived.dofs)
+    if samples is None and set(present.kernels.derived.dofs) == known < dofs:
+        samples = run.follow(p)  # all that has to be found are states of the candidate's own
     if samples is None and len(p) == 1:
         samples = run.evaluate(p[0])
     elif samples is None:

@@ -490,7 +490,8 @@ class RunPredictor:
         return self._at_samples(p, x, x_p, status, derivatives=True)
 
     def follow(self, p: Array) -> PredictedSamples | None:
-        """Outputs with derivatives where states follow :attr:`motions`, on which they do not act.
+        """Outputs with derivatives where states follow :attr:`motions`, or what drives the model,
+        and act on neither.
 
         All start from guesses, and take whole steps. What lags behind a motion, or is dragged along
         by it, is found in a few of these; with a residual that has to fall the iteration is caught
@@ -505,10 +506,10 @@ class RunPredictor:
         Returns
         -------
         PredictedSamples or None
-            Without a solution where the motion would be another one. None where no motion is known,
-            or there is no solution at all.
+            Without a solution where the motion would be another one. None where there is no
+            solution at all, or another integrator makes it.
         """
-        if type(self) is not RunPredictor or not self.motions:
+        if type(self) is not RunPredictor:
             return None
         guesses = np.concatenate([self.guess(row) for row in p])
         solution = solve_periodic(

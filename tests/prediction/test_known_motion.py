@@ -10,6 +10,8 @@ from bayesoleo.model import Model, Output, Parameter
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.solvers._orbit import Status
 
+BALANCE = "mass*ddot(q) + damping*dot(q) + stiffness*q + cubic*q**3 - x"
+
 
 def oscillator(extra: str = "", **parameters: Parameter) -> Model:
     """A mass on a spring that hardens; what is not asked for is fixed."""
@@ -19,12 +21,11 @@ def oscillator(extra: str = "", **parameters: Parameter) -> Model:
         "stiffness": Parameter(30.0, fixed=True),
         "cubic": Parameter(20.0, fixed=True),
     }
-    balance = "mass*ddot(q) + damping*dot(q) + stiffness*q + cubic*q**3 - x"
     return Model(
         "oscillator",
         inputs={"x": "N"},
         dofs={"q": "m"},
-        equations={"q": f"{balance}{extra}"},
+        equations={"q": f"{BALANCE}{extra}"},
         outputs={"y": Output("q", "m")},
         parameters=fixed | parameters,
     )
@@ -93,3 +94,89 @@ def test_a_model_with_another_state_is_solved(known):
     )
     run_, p = extension(known, lagging, rate=[1.0])
     assert run_.evaluate_on(known.runs[0], p) is None
+
+
+def with_memory() -> Model:
+    """The oscillator with a friction that remembers (Dahl's), of no force: an elastic slider."""
+    own = {"slide": Parameter(0.0, sd=1.0), "rate": Parameter(50.0, fixed=True)}
+    return Model(
+        "oscillator with a slider",
+        inputs={"x": "N"},
+        dofs={"q": "m", "z": "1"},
+        equations={
+            "q": f"{BALANCE} + slide*z",
+            "z": "dot(z) - rate*(dot(q) - abs(dot(q))*z)",
+        },
+        outputs={"y": Output("q", "m")},
+        parameters=oscillator().parameters | own,
+    )
+
+
+def following(known: Predictor, model: Model, **sets: list[float]):
+    run_, p = extension(known, model, **sets)
+    run_.motions, run_.watched = known.runs[0].known_motions(), False
+    return run_, p
+
+
+def test_states_that_follow_a_motion_are_found_for_every_set(known):
+    """Against central differences by solutions with a little of the force."""
+    rates, small = [0.3, 20.0, 1000.0], 1e-4
+    run_, p = following(known, with_memory(), rate=rates)
+    found = run_.follow(p)
+    assert found is not None
+    assert (found.status == Status.CONVERGED.value).all()
+    at = run_.kernels.derived.constants.index("slide")
+    for k, row in enumerate(p):
+        np.testing.assert_allclose(found.y[k], known.runs[0].predict(
+            known.constants(np.array([[30.0]]), 0)).y[0], atol=1e-11)  # fmt: skip
+        ends = []
+        for force in (small, -small):
+            other, _ = extension(known, with_memory(), rate=rates)
+            moved = row.copy()
+            moved[at] = force
+            ends.append(other.evaluate(moved).y[0])
+        expected = (ends[0] - ends[1]) / (2 * small)
+        # Kinks of the memory move with the force: the difference is of first order in it.
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(found.y_p[k, :, 0], expected, atol=2e-3 * scale)
+    assert run_.anchor is not None
+    np.testing.assert_array_equal(run_.anchor.p, p[0])
+
+
+def test_states_that_act_on_the_motion_do_not_follow_it(known):
+    run_, p = following(known, with_memory(), slide=[0.0, 3.0])
+    found = run_.follow(p)
+    assert found is not None
+    assert list(found.status) == [Status.CONVERGED.value, Status.NO_CONVERGENCE.value]
+    assert np.isfinite(found.y[0]).all()
+    assert np.isnan(found.y[1]).all()
+    run_, p = following(known, with_memory(), slide=[3.0])
+    assert run_.follow(p) is None
+    assert run_.anchor is None
+
+
+def test_states_of_a_force_law_follow_what_drives_it():
+    lag = Model(
+        "a force that lags",
+        inputs={"x": "m"},
+        dofs={"z": "m"},
+        equations={"z": "dot(z)/rate + z - x"},
+        outputs={"y": Output("stiffness*x + share*z", "N")},
+        parameters={
+            "stiffness": Parameter(2.0, fixed=True),
+            "share": Parameter(0.0, sd=1.0),
+            "rate": Parameter(1.0, fixed=True),
+        },
+    )
+    record = run("one", {"x": stroke(0.0, 2.0)}, 0.8, {}, others=("y",))
+    run_ = Predictor(lag, [record], steps=64, backend="numpy", jobs=1).runs[0]
+    p = np.repeat(run_.base_constants()[None], 2, axis=0)
+    rates = p[:, run_.kernels.derived.constants.index("rate")] = 3.0, 12.0
+    found = run_.follow(p)
+    assert found is not None
+    drive = record.harmonics["x"]
+    for k, rate in enumerate(rates):
+        turn = np.exp(2j * np.pi * np.outer(drive.orders, record.phase))
+        slow = drive.coefficients / (1 + 2j * np.pi * record.frequency * drive.orders / rate)
+        expected = (slow[:, None] * turn).real.sum(axis=0)
+        np.testing.assert_allclose(found.y_p[k, 0, 0], expected, atol=1e-5)
