@@ -10,6 +10,8 @@ loop over points into vector instructions.
 from __future__ import annotations
 
 import ctypes
+import glob
+import hashlib
 import pickle
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -39,32 +41,53 @@ _config: Any = numba_config
 
 
 class _CheckedFile(_CacheFile):  # type: ignore[misc]
-    """Files in which Numba keeps what it compiled of a function; those that are not whole, or of
-    other sources, are not there."""
+    """Files in which Numba keeps what it compiled of a function; those that are not whole are not
+    there.
 
-    def __init__(
-        self, cache_path: str, filename_base: str, function: Callable[..., Any], options: str
-    ) -> None:
-        # Another name than that of files without checksums, which others may read.
-        super().__init__(cache_path, f"{filename_base}.sha256", None)
+    Their names say what the code follows from: an index never stands beside data of other sources,
+    and what was compiled of one branch is there when it comes back.
+    """
+
+    def __init__(self, cache_path: str, base: str, function: Callable[..., Any], options: str):
+        # Not as Numba's files are named, which have no checksums and which others may read.
+        self._cache_path, self._base, self._version = cache_path, base, numba.__version__
         self._function, self._options = function, options
 
     @cached_property
     def _stamp(self) -> str:
         # Not when the function is made: it may call what its module makes later.
-        return f"{stamp_of(self._function)} {self._options}"
+        whole = f"{stamp_of(self._function)} {self._options} {self._version}"
+        return hashlib.sha256(whole.encode()).hexdigest()[:16]
+
+    @property
+    def _index_path(self) -> str:
+        return str(self._data_path(f"{self._base}.{self._stamp}.sha256.nbi"))
+
+    def _data_name(self, number: int) -> str:
+        return f"{self._base}.{self._stamp}.sha256.{number}.nbc"
 
     def _load_index(self) -> dict[Any, str]:
         content = unsealed(self._index_path)
         if content is None:
             return {}
-        version, stamp, overloads = pickle.loads(content)
-        current = (version, stamp) == (self._version, self._stamp)
-        return cast(dict[Any, str], overloads) if current else {}
+        return cast(dict[Any, str], pickle.loads(content))
 
     def _save_index(self, overloads: dict[Any, str]) -> None:
-        content = self._dump((self._version, self._stamp, overloads))
-        write_durably(Path(self._index_path), sealed(content))
+        path = Path(self._index_path)
+        if not path.exists():
+            self._drop_oldest()
+        write_durably(path, sealed(self._dump(overloads)))
+
+    def _drop_oldest(self) -> None:
+        """Keep what was compiled of the last few versions of the sources."""
+        folder = Path(self._cache_path)
+        with suppress(OSError):  # another process drops them too
+            known = list(folder.glob(f"{glob.escape(self._base)}.*.sha256.nbi"))
+            known.sort(key=lambda path: path.stat().st_mtime_ns, reverse=True)
+            for path in known[VERSIONS - 1 :]:
+                path.unlink()
+                for data in folder.glob(f"{glob.escape(path.stem)}.*.nbc"):
+                    data.unlink()
 
     def _load_data(self, name: str) -> Any:
         content = unsealed(self._data_path(name))
@@ -76,6 +99,8 @@ class _CheckedFile(_CacheFile):  # type: ignore[misc]
         write_durably(Path(self._data_path(name)), sealed(self._dump(data)))
 
 
+#: Versions of its sources of which what was compiled of a function is kept.
+VERSIONS = 4
 #: Told once that something is compiled, and who is or was told.
 _listeners: list[Callable[[str], object]] = []
 _telling: list[Callable[[str], object]] = []
@@ -117,7 +142,7 @@ class _CheckedCache(_FunctionCache):  # type: ignore[misc]
         super().__init__(function)
         self._cache_file = _CheckedFile(
             cache_path=self._cache_path,
-            filename_base=self._impl.filename_base,
+            base=self._impl.filename_base,
             function=function,
             options=f"{sorted(options.items())}, level {LEVEL}",
         )

@@ -1,25 +1,28 @@
-"""The sources that the machine code of a compiled function follows from.
+"""What the machine code of a compiled function follows from.
 
-Numba looks at the file of a function alone. What it compiled before would therefore be used after a
-function of another file, or a number that stands in one, has changed: results would not be those of
-the code. Here the files of all that a function calls count, by their content, and the numbers that
-it refers to.
+Numba looks at the file of a function alone, and at its date. What it compiled before would be used
+after a function of another file, or a number that stands in one, has changed: results would not be
+those of the code. Here the instructions of all functions that one calls count, as Python has read
+them, and the values that they refer to. Files do not: they may change while a process runs.
 """
 
 from __future__ import annotations
 
+import enum
 import hashlib
-import inspect
 from collections.abc import Callable, Iterator
 from functools import cache
-from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
+from numba.core import types
+from numba.core.typing.templates import Signature
 
 #: What code is compiled for the value of.
-VALUES = (bool, int, float, complex, str, tuple, np.generic)
+VALUES = (
+    bool, int, float, complex, str, tuple, np.generic, types.Type, Signature, type(None),
+)  # fmt: skip
 
 
 def stamp_of(function: Callable[..., Any]) -> str:
@@ -28,24 +31,20 @@ def stamp_of(function: Callable[..., Any]) -> str:
     Parameters
     ----------
     function : callable
-        As it is written, or as Numba compiles it. Of what it refers to, functions, classes and
-        modules of its own package count with their files, and numbers with their values.
+        As it is written, or as Numba compiles it. Functions of its own package that it refers to
+        count with their instructions, and so on; other packages have versions of their own.
     """
     package = _top(function.__module__)
-    files, values, seen, left = set[str](), set[str](), set[int](), [_written(function)]
+    lines, seen, left = list[str](), set[int](), [_written(function)]
     while left:
         one = left.pop()
         if id(one) in seen:
             continue
         seen.add(id(one))
-        file, values_of_one, called = _direct(one, package)
-        files |= file
-        values |= values_of_one
+        told, called = _direct(one, package)
+        lines.append(told)
         left += called
-    digest = hashlib.sha256()
-    for line in (*sorted(map(_content, files)), *sorted(values)):
-        digest.update(line.encode() + b"\n")
-    return digest.hexdigest()
+    return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()
 
 
 def _top(module: str) -> str:
@@ -58,30 +57,40 @@ def _written(function: Any) -> Any:
 
 
 @cache
-def _direct(
-    function: FunctionType, package: str
-) -> tuple[frozenset[str], frozenset[str], tuple[FunctionType, ...]]:
-    """Files, values and functions that a function refers to, with its own file."""
-    files, values, called = {function.__code__.co_filename}, set[str](), list[FunctionType]()
+def _direct(function: FunctionType, package: str) -> tuple[str, tuple[FunctionType, ...]]:
+    """What a function is made of and the values that it refers to, as a text; and the functions of
+    its package that it refers to."""
+    told, called = [_told(function.__code__), repr(function.__defaults__)], list[FunctionType]()
     for name, value in _referred(function, package):
         written = _written(value)
-        module = value.__name__ if isinstance(value, ModuleType) else _module_of(written)
-        if _top(module) != package:
-            if isinstance(value, VALUES):
-                values.add(f"{name} = {value!r}")
-        elif isinstance(written, FunctionType):
-            called.append(written)
-        else:
-            files.add(
-                inspect.getfile(value if isinstance(value, ModuleType | type) else type(value))
-            )
-    return frozenset(files), frozenset(values), tuple(called)
+        if isinstance(written, FunctionType):
+            if _top(written.__module__) == package:
+                called.append(written)
+        elif isinstance(value, np.ndarray):
+            told.append(f"{name}: {value.dtype} {value.shape} {value.tobytes().hex()}")
+        elif isinstance(value, type):
+            told.append(f"{name}: {_told_class(value)}")
+        elif isinstance(value, VALUES):
+            told.append(f"{name}: {value!r}")
+    return "; ".join(told), tuple(called)
 
 
-def _module_of(value: Any) -> str:
-    """Where a function or a class was made, or the class of anything else."""
-    owner = value if isinstance(value, FunctionType | type) else type(value)
-    return str(owner.__module__)
+def _told(code: CodeType) -> str:
+    """Instructions with what they refer to by number; not where they stand in a file."""
+    parts = [
+        _told(one) if isinstance(one, CodeType) else f"{type(one).__name__} {one!r}"
+        for one in code.co_consts
+    ]
+    names = code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars
+    counts = code.co_argcount, code.co_kwonlyargcount, code.co_flags
+    return f"{code.co_name} {code.co_code.hex()} {parts} {names} {counts}"
+
+
+def _told_class(kind: type) -> str:
+    """Names of a tuple's fields, or the members of an enumeration."""
+    if issubclass(kind, enum.Enum):
+        return f"{kind.__qualname__} {[(one.name, one.value) for one in kind]}"
+    return f"{kind.__qualname__} {getattr(kind, '_fields', ())}"
 
 
 def _referred(function: FunctionType, package: str) -> Iterator[tuple[str, Any]]:
@@ -103,12 +112,3 @@ def _names(code: CodeType) -> Iterator[str]:
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
             yield from _names(constant)
-
-
-@cache
-def _content(file: str) -> str:
-    """Digest of a file; of one that cannot be read, its name."""
-    try:
-        return hashlib.sha256(Path(file).read_bytes()).hexdigest()
-    except OSError:
-        return file

@@ -11,7 +11,7 @@ therefore detected and left out.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import cast
 
@@ -119,7 +119,11 @@ def squared_distance(value: Array, covariance: Array) -> float:
 
 
 def resolved_sensitivities(
-    run: RunPredictor, p: Array, samples: PredictedSamples, changed: Sequence[int]
+    run: RunPredictor,
+    p: Array,
+    samples: PredictedSamples,
+    changed: Sequence[int],
+    again: Callable[[Array], PredictedSamples | None] | None = None,
 ) -> Array:
     """Derivatives of the outputs, zero where they are round-off.
 
@@ -136,6 +140,9 @@ def resolved_sensitivities(
         With derivatives ``(L, ny, na, N)``.
     changed : sequence of int
         Which of the constants may be changed for the second look.
+    again : callable, optional
+        Samples with derivatives at other constants ``(L, np)``, as those were found; by default
+        from the anchor. What has no solution there is left as it is.
 
     Returns
     -------
@@ -151,11 +158,12 @@ def resolved_sensitivities(
     nearby = p.copy()
     # Each by a factor of its own, lest a common one scale all equations and change no digit.
     nearby[:, changed] *= 1 + CHANGE * np.linspace(1.0, 2.0, len(changed))
-    again = run.predict(nearby, derivatives=True)
-    if again.y_p is None or (again.status != Status.CONVERGED.value).any():
+    second = run.predict(nearby, derivatives=True) if again is None else again(nearby)
+    if second is None or second.y_p is None:
         return y_p
-    moved = np.linalg.norm(again.y_p - y_p, axis=-1)
-    noisy = suspect & (moved > REPEATS * np.linalg.norm(y_p, axis=-1))
+    solved = second.status == Status.CONVERGED.value
+    moved = np.linalg.norm(second.y_p - y_p, axis=-1)
+    noisy = suspect & (moved > REPEATS * np.linalg.norm(y_p, axis=-1)) & solved[:, None, None]
     return np.where(noisy[..., None], 0.0, y_p)
 
 
@@ -276,9 +284,11 @@ def _of_run(fit: ModelFit, r: int, run: RunPredictor, p: Array) -> Array | Statu
     samples = run.evaluate_on(present, p)
     if samples is not None and not (samples.status == Status.CONVERGED.value).all():
         samples = None
-    known, dofs = run.motions.keys(), set(run.kernels.derived.dofs)
+    known, dofs, again = run.motions.keys(), set(run.kernels.derived.dofs), None
     if samples is None and set(present.kernels.derived.dofs) == known < dofs:
-        samples = run.follow(p)  # all that has to be found are states of the candidate's own
+        # All that has to be found are states of the candidate's own.
+        samples = run.follow(p)
+        again = None if samples is None else run.follow
     if samples is None and len(p) == 1:
         samples = run.evaluate(p[0])
     elif samples is None:
@@ -291,9 +301,7 @@ def _of_run(fit: ModelFit, r: int, run: RunPredictor, p: Array) -> Array | Statu
         return _of_two_parts(fit, r, run, p, solved)
     if not solved.all() or samples.y_p is None:
         return Status(int(samples.status.max()))
-    constants = run.kernels.derived.constants
-    own = [k for k, name in enumerate(constants) if name in fit.model.parameters]
-    return resolved_sensitivities(run, p, samples, own)
+    return resolved_sensitivities(run, p, samples, _own(fit, run), again)
 
 
 def _anchored(run: RunPredictor, p: Array) -> Status:
@@ -319,12 +327,30 @@ def _of_two_parts(
         return first
     found = np.full((len(p), *first.shape[1:]), np.nan)
     found[solved] = first
+    anchor = run.anchor
     for lane in np.flatnonzero(~solved):
         run.anchor = None
         derivatives = _of_run(fit, r, run, p[[lane]])
+        if isinstance(derivatives, Status) and anchor is not None:
+            run.anchor = anchor
+            derivatives = _from_another(fit, run, p[[lane]])
         if not isinstance(derivatives, Status):
             found[lane] = derivatives[0]
     return found
+
+
+def _from_another(fit: ModelFit, run: RunPredictor, p: Array) -> Array | Status:
+    """Derivatives at constants ``(1, np)`` whose motion is reached from the anchor alone."""
+    samples = run.predict(p, derivatives=True)
+    if samples.status[0] != Status.CONVERGED.value or samples.y_p is None:
+        return Status(int(samples.status[0]))
+    return resolved_sensitivities(run, p, samples, _own(fit, run))
+
+
+def _own(fit: ModelFit, run: RunPredictor) -> list[int]:
+    """Which constants of a run's model are parameters of the present one."""
+    constants = run.kernels.derived.constants
+    return [k for k, name in enumerate(constants) if name in fit.model.parameters]
 
 
 def present_constants(fit: ModelFit, r: int) -> Array:

@@ -489,9 +489,9 @@ def log_sum(logs: Array) -> Array:
 
 def log_sum_of(logs: Sequence[float]) -> float:
     """The same of a few numbers, of which arrays would take most of the time."""
+    if not all(map(math.isfinite, logs)):
+        return float(log_sum(np.array(logs)))
     top = max(logs)
-    if not math.isfinite(top):
-        return top
     return top + math.log(sum(math.exp(one - top) for one in logs))
 
 

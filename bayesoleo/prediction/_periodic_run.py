@@ -50,9 +50,10 @@ FEW_STEPS = 1024
 #: undamped ones leave one in 100. After 4 damped ones a density takes 0.86 times as long as after
 #: 10.
 FIRST_DAMPED, WHOLE_STEPS, DAMPED_STEPS = 4, 200, 40
-#: Whole steps by which states are found that follow a known motion, and the part of its norm by
-#: which a motion may differ from the known one: by that of another mesh, and not another motion.
-FOLLOWING, KEPT = 40, 1e-3
+#: Whole steps by which states are found that follow a known motion; and the part of its size about
+#: its mean by which a motion may differ from the known one, as on another mesh, and not as another
+#: motion does, with that of the whole by which one at rest may.
+FOLLOWING, KEPT, AT_REST = 40, 1e-3, 1e-9
 #: Threads share a run.
 _COUNTING = threading.Lock()
 
@@ -525,8 +526,11 @@ class RunPredictor:
             return None
         k = int(solved[0])
         moved = np.ascontiguousarray(np.moveaxis(x_p[k], 2, 0))
+        samples = self._at_samples(p, solution.x, x_p, status, derivatives=True)
+        if not (samples.status == Status.CONVERGED.value).any():
+            return None
         self.anchor = Anchor(p[k].copy(), solution.x[k], moved, monodromy[k])
-        return self._at_samples(p, solution.x, x_p, status, derivatives=True)
+        return samples
 
     def _is_known(self, x: Array, guess: Array) -> bool:
         """Whether dofs whose motions are known move as they were guessed to."""
@@ -537,7 +541,9 @@ class RunPredictor:
         ]
         expected = self.rows(guess, nodes)[known]
         away = np.linalg.norm(self.rows(x, nodes)[known] - expected, axis=1)
-        return bool(np.all(away <= KEPT * np.linalg.norm(expected, axis=1)))
+        about = np.linalg.norm(expected - expected.mean(axis=1, keepdims=True), axis=1)
+        whole = np.linalg.norm(expected, axis=1)
+        return bool(np.all(away <= np.maximum(KEPT * about, AT_REST * whole)))
 
     def _moves_like(self, other: RunPredictor) -> bool:
         """Whether unknowns mean the same: one mesh, and the same states in the same order."""

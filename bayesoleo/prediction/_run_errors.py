@@ -518,9 +518,10 @@ def _inputs_at(run: RunPredictor) -> Callable[[Array], Array]:
     if not record.periodic:
         return lambda position: input_rows(record, rows, position)
     signal = signal_of_rows(record, rows)
+    # A copy: compiled code takes what may be written to.
     return lambda phase: _of_records.of(
         record, (rows, phase.tobytes()), lambda: evaluate(signal, phase * run.period)
-    )
+    ).copy()
 
 
 def outputs_of(run: RunPredictor, estimate: ErrorEstimate) -> Array | None:

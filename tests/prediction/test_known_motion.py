@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from synthetic_runs import run, stroke
@@ -153,6 +155,27 @@ def test_states_that_act_on_the_motion_do_not_follow_it(known):
     run_, p = following(known, with_memory(), slide=[3.0])
     assert run_.follow(p) is None
     assert run_.anchor is None
+
+
+def test_a_motion_about_a_large_mean_is_not_taken_for_another(known):
+    """An offset of the coordinate hides nothing of how the motion changes."""
+    balance = BALANCE.replace("stiffness*q + cubic*q**3", "stiffness*(q - 300)")
+    plain = replace(oscillator(), equations={"q": balance})
+    record = known.records[0]
+    far = Predictor(plain, [record], steps=64, backend="numpy", jobs=1).runs[0]
+    p = far.base_constants()
+    assert far.set_anchor(p) is Status.CONVERGED
+    memory = "dot(z) - rate*(dot(q) - abs(dot(q))*z)"
+    model = replace(
+        with_memory(), equations={"q": f"{balance} + slide*z", "z": memory}
+    )  # fmt: skip
+    run_ = Predictor(model, [record], steps=64, backend="numpy", jobs=1).runs[0]
+    run_.motions, run_.watched = far.known_motions(), False
+    p = np.repeat(run_.base_constants()[None], 2, axis=0)
+    p[1, run_.kernels.derived.constants.index("slide")] = 3.0
+    found = run_.follow(p)
+    assert found is not None
+    assert list(found.status) == [Status.CONVERGED.value, Status.NO_CONVERGENCE.value]
 
 
 def test_states_of_a_force_law_follow_what_drives_it():
