@@ -442,7 +442,7 @@ def test_another_process_judges_runs_alike(monkeypatch):
     monkeypatch.setattr(processes, "WORTH_ASKING", 0.0)
     records = [free_decay("a", 0.1), free_decay("bb", 0.2)]
     state = fit_state(Assembly(decay_model()), _roles_of(records[:1]), NUMERICS)
-    ask, asked, told = processes._Worker.ask, [], []
+    ask, asked, told = kept_processes.Worker.ask, [], []
 
     def counted(worker, message, known=()):
         found = ask(worker, message, known)
@@ -455,7 +455,7 @@ def test_another_process_judges_runs_alike(monkeypatch):
 
     predictive_distribution = _next_experiment.predictive_distribution
     monkeypatch.setattr(_next_experiment, "predictive_distribution", slowly)
-    monkeypatch.setattr(processes._Worker, "ask", counted)
+    monkeypatch.setattr(kept_processes.Worker, "ask", counted)
     try:
         worker = kept_processes.process_of(0, processes.OF_A_SEARCH)
         worker.ask(messages.dumps((None, None, None)))  # it answers once it has begun
