@@ -63,6 +63,8 @@ def package(tmp_path, monkeypatch):
         (folder / name).write_text("\n".join(line[indent:] for line in lines))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    # Python takes a file of the same second and size for the one that it has compiled.
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
     return folder
 
 
