@@ -3,7 +3,7 @@
 Numba looks at the file of a function alone, and at its date. What it compiled before would be used
 after a function of another file, or a number that stands in one, has changed: results would not be
 those of the code. Here the instructions of all functions that one calls count, as Python has read
-them, and the values that they refer to. Files do not: they may change while a process runs.
+them, and the values that they refer to. Files do not count: they may change while a process runs.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ def _written(function: Any) -> Any:
 def _direct(function: FunctionType, package: str) -> tuple[str, tuple[FunctionType, ...]]:
     """What a function is made of and the values that it refers to, as a text; and the functions of
     its package that it refers to."""
-    told, called = [_told(function.__code__), repr(function.__defaults__)], list[FunctionType]()
+    given = function.__defaults__, function.__kwdefaults__
+    told, called = [_told(function.__code__), repr(given)], list[FunctionType]()
     for name, value in _referred(function, package):
         written = _written(value)
         if isinstance(written, FunctionType):

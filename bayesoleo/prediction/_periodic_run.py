@@ -50,9 +50,9 @@ FEW_STEPS = 1024
 #: undamped ones leave one in 100. After 4 damped ones a density takes 0.86 times as long as after
 #: 10.
 FIRST_DAMPED, WHOLE_STEPS, DAMPED_STEPS = 4, 200, 40
-#: Whole steps by which states are found that follow a known motion; and the part of its size about
-#: its mean by which a motion may differ from the known one, as on another mesh, and not as another
-#: motion does, with that of the whole by which one at rest may.
+#: Whole steps by which states are sought that follow a known motion. A solution on another mesh
+#: differs from that motion by less than this part of its size about its mean, and another motion by
+#: more. A coordinate at rest may differ by this part of its value.
 FOLLOWING, KEPT, AT_REST = 40, 1e-3, 1e-9
 #: Threads share a run.
 _COUNTING = threading.Lock()
