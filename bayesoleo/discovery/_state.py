@@ -9,6 +9,9 @@ optimum on either side of each, and an estimate ends in the one nearest its star
 
 from __future__ import annotations
 
+import threading
+import weakref
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -193,8 +196,39 @@ class State:
 
     def base(self) -> Base:
         """Residuals and sensitivities for the scores of candidates, on a mesh for comparisons."""
-        entries, fit = self.fit_errors.entries, for_comparison(self.fit)
-        return base_of(fit, {(entry.run, entry.output): entry for entry in entries})
+        return _bases.of(self)
+
+
+class _Bases:
+    """Bases of the states that were asked for last: a round, what it adds and what confirms that
+    begin with the same ones. Each may hold hundreds of columns of a record."""
+
+    MOST = 2
+
+    def __init__(self) -> None:
+        self.kept = OrderedDict[int, tuple[weakref.ref[State], Base]]()
+        self.lock = threading.Lock()
+
+    def of(self, state: State) -> Base:
+        """The base of a state, kept or made now."""
+        with self.lock:
+            known = self.kept.get(id(state))
+            if known is not None and known[0]() is state:  # not of another one that is gone
+                self.kept.move_to_end(id(state))
+                return known[1]
+        fit = for_comparison(state.fit)
+        entries = {(entry.run, entry.output): entry for entry in state.fit_errors.entries}
+        base = base_of(fit, entries)
+        with self.lock:
+            self.kept[id(state)] = weakref.ref(state), base
+            self.kept.move_to_end(id(state))
+            gone = [key for key, (one, _) in self.kept.items() if one() is None]
+            for key in gone or list(self.kept)[: -self.MOST]:
+                del self.kept[key]
+        return base
+
+
+_bases = _Bases()
 
 
 def state_of(assembly: Assembly, fit: ModelFit, roles: Roles) -> State:

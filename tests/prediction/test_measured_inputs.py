@@ -155,6 +155,39 @@ def test_many_harmonics_with_noise_are_a_few_columns_of_the_same_size(cubic, mon
     np.testing.assert_allclose(sums[0], sums[1], rtol=1e-5 if cubic == 0.0 else 0.5)
 
 
+def test_changes_by_the_inputs_are_kept_until_anything_that_they_depend_on_is_another():
+    predictor, run = of_a_multisine({"displacement": Output("x", "m")})
+    model, (record,) = predictor.model, predictor.records
+    p = predictor.constants(np.array([[0.1, 0.05]]), 0)[0]
+    run.set_anchor(p)
+    first = input_columns(run, p)
+    assert not first.flags.writeable
+    assert input_columns(run, p) is first
+    assert input_columns(run, p, draws=4) is not first
+    assert not np.array_equal(input_columns(run, p + np.array([0.0, 0.01])), first)
+
+    def by_another(model, record, steps=2048):
+        other = Predictor(model, [record], steps=steps, backend="numpy", jobs=1).runs[0]
+        other.set_anchor(p)
+        return input_columns(other, p)
+
+    # A score of the same run has a predictor of its own, and one solution in all digits or not.
+    np.testing.assert_allclose(by_another(model, record), first, atol=1e-9)
+    twice = replace(model, outputs={"displacement": Output("2*x", "m")})
+    np.testing.assert_allclose(by_another(twice, record), 2.0 * first, atol=1e-9)
+    louder = replace(record, harmonics=louder_harmonics(record))
+    np.testing.assert_allclose(by_another(model, louder), 3.0 * first, atol=1e-9)
+    assert not np.allclose(by_another(model, record, steps=1024), first, rtol=0.0, atol=1e-9)
+
+
+def louder_harmonics(record):
+    """Three times the noise in each."""
+    return {
+        name: replace(item, variances=9.0 * item.variances)
+        for name, item in record.harmonics.items()
+    }
+
+
 def test_few_harmonics_keep_a_column_each():
     (known,) = multisine_campaign(resonance, realisations=1, input_noise=0.1).records
     item = known.harmonics["force"]
