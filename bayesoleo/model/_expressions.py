@@ -106,6 +106,9 @@ FUNCTIONS: dict[str, object] = {
 }
 
 
+_AS_IN_PYTHON = "write it as in Python, e.g. k*q**3"
+
+
 @cache
 def symbol(name: str) -> sp.Symbol:
     """The symbol of a declared name; every quantity is real."""
@@ -221,16 +224,28 @@ def parse(
     """
     if isinstance(text, sp.Expr):
         return text
-    hint = "write it as in Python, e.g. k*q**3"
     if isinstance(text, int | float) and not isinstance(text, bool):
         return sp.sympify(text)
     if not isinstance(text, str):
-        raise ModelError(f"{where}: not an expression", value=text, hint=hint)
+        raise ModelError(f"{where}: not an expression", value=text, hint=_AS_IN_PYTHON)
+    behind = tuple((whole or {}).items())
+    return _built(text, tuple(known.items()), tuple(dynamic), where, behind)
+
+
+@lru_cache(maxsize=4096)  # each round of a search writes its effects into the model anew
+def _built(
+    text: str,
+    known: tuple[tuple[str, sp.Expr], ...],
+    dynamic: tuple[str, ...],
+    where: str,
+    whole: tuple[tuple[str, sp.Expr], ...],
+) -> sp.Expr:
+    """The expression of a text."""
     try:
         tree = ast.parse(text.strip(), mode="eval")
     except SyntaxError as error:
         raise ModelError(f"{where}: not an expression", value=text, hint=_slip(text)) from error
-    builder = _Builder({**known}, {**known, **(whole or {})}, tuple(dynamic), where, text)
+    builder = _Builder(dict(known), {**dict(known), **dict(whole)}, dynamic, where, text)
     built = sp.sympify(builder.visit(tree.body))
     if built.has(sp.nan, sp.zoo, sp.oo, -sp.oo, sp.I):
         raise ModelError(f"{where}: not a finite real number", value=text, hint="mind 1/0 and 0/0")

@@ -128,3 +128,17 @@ def test_symbols_are_replaced_everywhere_and_at_once():
         at = dict(zip((q, v, lag), values, strict=True))
         assert float(found.subs(at)) == pytest.approx(float(expected.subs(at)), rel=1e-12)
     assert with_symbols_as(before, {lag: q}) is before
+
+
+def test_the_same_text_is_read_anew_where_a_name_means_something_else():
+    q, force = symbol("q"), symbol("force")
+    known = {"x": q, "k": symbol("stiffness")}
+    assert parse("k*x", known, ("q",), "here") == known["k"] * q
+    assert parse("k*x", known | {"x": force}, ("q",), "here") == known["k"] * force
+    rate = derivative_symbol("force", 1)
+    assert parse("dot(x)", known | {"x": force}, ("force",), "here") == rate
+    whole = {"x": force**2}
+    assert parse("dot(x)", known | {"x": force}, ("force",), "here", whole) == 2 * force * rate
+    for where in ("here", "there", "there"):
+        with pytest.raises(ModelError, match=rf"^{where}"):
+            parse("k*unheard_of", known, ("q",), where)
