@@ -434,8 +434,12 @@ class Beside[S, R]:
 
     def __exit__(self, kind: object, *_: object) -> None:
         if kind is not None:
-            kill_processes()
-            self._thread.join()
+            self.drop()
+
+    def drop(self) -> None:
+        """End the process: nobody waits for what it does."""
+        kill_processes()
+        self._thread.join()
 
     def result(self) -> R:
         """What came of it, or the exception that it raised, when it is done."""

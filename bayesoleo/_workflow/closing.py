@@ -18,7 +18,7 @@ import xarray as xr
 
 from bayesoleo._first_compilation import is_marked
 from bayesoleo._types import ProgressCallback
-from bayesoleo._worker_processes import start_ahead
+from bayesoleo._worker_processes import Beside, start_ahead
 from bayesoleo._workflow.estimating import NOT_SAMPLED, draw, inference_for
 from bayesoleo._workflow.output import (
     POSTERIOR_STAGE,
@@ -39,16 +39,18 @@ from bayesoleo._workflow.output import (
     write_result,
 )
 from bayesoleo._workflow.settings import Settings
-from bayesoleo._workflow.structures_beside import Answer, Asked, answered, begun_beside, pictures_of
+from bayesoleo._workflow.structures_beside import (
+    Answer,
+    Asked,
+    Early,
+    answered,
+    begun_beside,
+    pictures_of,
+)
 from bayesoleo._workflow.task import Source, Task, prepare, silent
 from bayesoleo.discovery._compile_ahead import compile_meanwhile
 from bayesoleo.discovery._inference import CATALOGUE
-from bayesoleo.discovery._loop import (
-    ClosedLoop,
-    close_loop,
-    judged,
-    loop_of,
-)
+from bayesoleo.discovery._loop import Ahead as SearchAhead, ClosedLoop, close_loop, judged, loop_of
 from bayesoleo.discovery._next_experiment import check_aim
 from bayesoleo.discovery._open_questions import Question, questions_of
 from bayesoleo.discovery._round import Progress
@@ -140,21 +142,27 @@ def close(
     task = prepare(campaign, model, settings, progress=progress)
     start_ahead(jobs=settings.jobs)  # else once less is compiled at the same time
     _check_aim(task)
-    with output.alone():
-        stages, begun = Stages(callback), time.monotonic()
+    stages, begun = Stages(callback), time.monotonic()
+
+    def begin(loop: ClosedLoop) -> tuple[Groups | None, Beside[Asked, Answer] | None]:
+        if time.monotonic() - begun > WORTH_KEEPING:
+            return None, None
+        known, shown = _shown_early(task, loop, output)
+        return known, begun_beside(_asked_of(task, loop), shown, settings.jobs)
+
+    with output.alone(), Early(begin, settings.jobs) as early:
         loop = run_loop(
-            task, settings.max_effects, stages, output, resume=True, leave_structures=settings.quick
-        )
-        ask = Asked(
-            loop, settings.numerics, settings.structure_prior, task.campaign.rig, settings.next_run
-        )
+            task, settings.max_effects, stages, output, resume=True,
+            ahead=early if settings.quick else None,
+        )  # fmt: skip
         # A search that took long is written with its probabilities before the draws.
-        first = not settings.quick or time.monotonic() - begun > WORTH_KEEPING
-        known, shown = (None, None) if first else _shown_early(task, loop, output)
-        beside = None if first else begun_beside(ask, shown, settings.jobs)
+        long = time.monotonic() - begun > WORTH_KEEPING and not early.is_for(loop)
+        first = not settings.quick or long
+        known, beside = (None, None) if first else early.of(loop)
         questions, groups, ahead, place = no_questions(), None, None, output.checkpoints
         if beside is None:
-            loop, questions = with_structures(task, loop, answered(ask, callback), stages)
+            found = answered(_asked_of(task, loop), callback)
+            loop, questions = with_structures(task, loop, found, stages)
         if first:
             _write_found(task, loop, output, stages, questions)
         callback("sample the posterior")
@@ -170,6 +178,13 @@ def close(
                 loop, questions = with_structures(task, loop, beside.result(), stages)
                 ahead = partial(pictures_of, beside)
         return written(task, loop, drawn, output, stages, questions, groups, ahead)
+
+
+def _asked_of(task: Task, loop: ClosedLoop) -> Asked:
+    settings = task.settings
+    return Asked(
+        loop, settings.numerics, settings.structure_prior, task.campaign.rig, settings.next_run
+    )
 
 
 def _shown_early(
@@ -318,7 +333,7 @@ def run_loop(
     output: ResultFolder,
     *,
     resume: bool = False,
-    leave_structures: bool = False,
+    ahead: SearchAhead | None = None,
 ) -> ClosedLoop:
     """Rounds until nothing is missing, or nothing helps; the posterior is not sampled.
 
@@ -334,8 +349,9 @@ def run_loop(
         Written to after the estimate and after each round.
     resume : bool
         Whether to keep how far the search has come, and to go on from there.
-    leave_structures : bool
-        Whether to leave their probabilities to :func:`with_structures`.
+    ahead : callable, optional
+        As of :func:`~bayesoleo.discovery._loop.close_loop`; where it is given, the probabilities of
+        structures are left to :func:`with_structures`.
 
     Raises
     ------
@@ -377,7 +393,7 @@ def run_loop(
             keep=keep,
             keep_columns=max_effects > 0 and settings.inference.error_model in (AUTO, CATALOGUE),
             declared=task.declared,
-            leave_structures=leave_structures,
+            ahead=ahead,
             callback=callback,
         )
     except Exception as error:

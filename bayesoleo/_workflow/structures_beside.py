@@ -4,16 +4,16 @@ while this one draws from the posterior, which does not depend on them; then fig
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import xarray as xr
 
 from bayesoleo._parallel import single_blas_thread
 from bayesoleo._report.page_figures import WITHOUT_DRAWS, draw_ahead, shared_by
 from bayesoleo._types import ProgressCallback
-from bayesoleo._worker_processes import Beside
+from bayesoleo._worker_processes import Beside, start_ahead
 from bayesoleo._workflow.output import PROPOSALS_STAGE, SEARCH_STAGE, reason_of
 from bayesoleo.discovery._loop import ClosedLoop, judged, structures_of
 from bayesoleo.discovery._numerics import Numerics
@@ -119,6 +119,60 @@ def begun_beside(
         return None
     then = None if shown is None else (draw_ahead, shared_by(shown), list(WITHOUT_DRAWS))
     return Beside.begun(answer, asked, jobs, then)
+
+
+class Early[K]:
+    """The answer to what a search asks, begun before it is known whether the search has ended.
+
+    Left by an exception, the other process is ended.
+
+    Parameters
+    ----------
+    begin : callable
+        Of a loop: anything to keep with the answer, and the answer as of :func:`begun_beside`.
+    jobs : int, optional
+        Processes, this one included.
+    """
+
+    def __init__(
+        self,
+        begin: Callable[[ClosedLoop], tuple[K | None, Beside[Asked, Answer] | None]],
+        jobs: int | None,
+    ) -> None:
+        self._begin, self._jobs = begin, jobs
+        self._loop: ClosedLoop | None = None
+        self._known: K | None = None
+        self._beside: Beside[Asked, Answer] | None = None
+
+    def __call__(self, loop: ClosedLoop) -> Callable[[], None]:
+        """Begin, for a search that may go on; returns :meth:`drop`."""
+        self._loop, (self._known, self._beside) = loop, self._begin(loop)
+        return self.drop
+
+    def drop(self) -> None:
+        """End what was begun, and have a process ready for what comes."""
+        if self._beside is not None:
+            self._beside.drop()
+            start_ahead(jobs=self._jobs)
+        self._loop = self._known = self._beside = None
+
+    def is_for(self, loop: ClosedLoop) -> bool:
+        """Whether the answer is on its way for this loop."""
+        return self._beside is not None and loop is self._loop
+
+    def of(self, loop: ClosedLoop) -> tuple[K | None, Beside[Asked, Answer] | None]:
+        """What was begun for this loop, or is now."""
+        if loop is not self._loop:
+            self.drop()
+            self(loop)
+        return self._known, self._beside
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if kind is not None and self._beside is not None:
+            self._beside.drop()
 
 
 def pictures_of(beside: Beside[Asked, Answer]) -> dict[str, list[Any]]:

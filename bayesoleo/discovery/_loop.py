@@ -301,6 +301,10 @@ class ClosedLoop:
         )
 
 
+#: Takes a result that may not stand, and gives what to call where it does not.
+type Ahead = Callable[[ClosedLoop], Callable[[], None]]
+
+
 @single_blas_thread()  # matrices are small: threads take longer to meet than to work
 def close_loop(
     assembly: Assembly,
@@ -317,7 +321,7 @@ def close_loop(
     keep: Callable[[Progress], None] = lambda _: None,
     keep_columns: bool = False,
     declared: ModelFit | None = None,
-    leave_structures: bool = False,
+    ahead: Ahead | None = None,
     callback: ProgressCallback = lambda _: None,
 ) -> ClosedLoop:
     """Fit a model and add the effects that it lacks, one after the other.
@@ -353,9 +357,11 @@ def close_loop(
     declared : ModelFit, optional
         The declared model's estimate, if it was made before: by :func:`fit_model`, by these runs
         and numerics.
-    leave_structures : bool
-        Whether the caller compares structures, by :func:`structures_of` and :func:`judged`: no
-        estimate depends on it.
+    ahead : callable, optional
+        Where it is given, the caller compares structures, by :func:`structures_of` and
+        :func:`judged`: no estimate depends on that. It receives the result that stands unless
+        another first effect leads as far. What it returns is called where the search is done again
+        with another one.
     callback : callable
         Receives a message at each step.
 
@@ -371,8 +377,11 @@ def close_loop(
         most_work,
     )  # fmt: skip
     known = searched(known, search)
+    drop: Callable[[], None] | None = None
 
     def follow(other: Progress, most: int) -> Progress:
+        if drop is not None:
+            drop()
         quiet = replace(
             search,
             max_effects=most,
@@ -387,11 +396,15 @@ def close_loop(
     if _went_no_further(known):
         # What it would have found is not among what probabilities are of.
         return loop_of(known.ended(ENDED), roles)
-    known = best_of_beam(known, roles, numerics, follow, effects, max_effects, callback)
     loop = replace(loop_of(known, roles), without_structures=known)
-    if leave_structures:
+    if ahead is not None:
+        drop = ahead(loop)
+    best = best_of_beam(known, roles, numerics, follow, effects, max_effects, callback)
+    if best is not known:
+        loop = replace(loop_of(best, roles), without_structures=best)
+    if ahead is not None:
         return loop
-    return judged(loop, structures_of(known, numerics, prior, callback))
+    return judged(loop, structures_of(best, numerics, prior, callback))
 
 
 def judged(loop: ClosedLoop, found: StructurePosterior | str | None) -> ClosedLoop:

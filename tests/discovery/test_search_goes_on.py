@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from small_campaigns import damper, damper_campaign
 
+from bayesoleo.discovery import _state
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._loop import close_loop, loop_of
 from bayesoleo.discovery._numerics import Numerics
@@ -64,3 +65,54 @@ def test_a_search_that_broke_off_ends_in_a_round_that_says_why(searched):
     assert broken.broken
     assert not loop_of(broken, roles).certain
     assert replace(finished, rounds=finished.rounds[:1]).finished is False
+
+
+@pytest.mark.parametrize("another_first_effect", [False, True])
+def test_what_stands_so_far_is_given_ahead_and_dropped_where_the_search_is_done_again(
+    searched, monkeypatch, another_first_effect
+):
+    roles, loop, kept = searched
+    events: list[object] = []
+
+    def beam(progress, roles, numerics, follow, *_):
+        events.append("beam")
+        return follow(replace(progress), 2) if another_first_effect else progress
+
+    def ahead(found):
+        events.append(found)
+        return lambda: events.append("drop")
+
+    monkeypatch.setattr("bayesoleo.discovery._loop.best_of_beam", beam)
+    again = close_loop(
+        Assembly(damper()), roles, NUMERICS, effects=EFFECTS, seed=3,
+        known=cloudpickle.loads(cloudpickle.dumps(kept[-1])), ahead=ahead,
+    )  # fmt: skip
+    given, *rest = events
+    assert rest == (["beam", "drop"] if another_first_effect else ["beam"])
+    # Structures are left to the caller, of the search that the result is of.
+    assert again.structures is None
+    assert (again is given) == (not another_first_effect)
+    assert again.effects == loop.effects
+
+
+def test_the_base_of_a_state_is_made_once_and_not_kept_for_all(searched):
+    _, loop, _ = searched
+    one, two = (entry.before for entry in loop.rounds[:2])
+    base = one.base()
+    assert two.base() is not base
+    assert one.base() is base
+    # States of their own, though of the same value; only the last two are kept.
+    copies = [replace(two) for _ in range(2)]
+    assert copies[0].base() is not copies[1].base()
+    assert one.base() is not base
+    np.testing.assert_array_equal(one.base().gram, base.gram)
+
+
+def test_bases_go_with_their_states(searched):
+    _, loop, _ = searched
+    bases, state = _state._Bases(), replace(loop.first)
+    bases.of(state)
+    del state
+    other = replace(loop.first)
+    bases.of(other)
+    assert list(bases.kept) == [id(other)]
