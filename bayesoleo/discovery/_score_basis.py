@@ -41,6 +41,9 @@ LEAST = 1e-8
 #: Sums of products over some 1e5 samples are good to this part of the size of what they sum.
 ROUND_OFF = 1e3 * float(np.finfo(float).eps)
 
+#: Samples at some constants, near others at which they were found in the same way.
+type Again = Callable[[Array], PredictedSamples | None]
+
 #: A sensitivity is computed again if a parameter that moves a state by its full size moves an
 #: output by less than this part of the output's size: solutions are good to some 1e-13 of their
 #: size, and the second computation confirms a real one.
@@ -123,7 +126,7 @@ def resolved_sensitivities(
     p: Array,
     samples: PredictedSamples,
     changed: Sequence[int],
-    again: Callable[[Array], PredictedSamples | None] | None = None,
+    again: Again | None = None,
 ) -> Array:
     """Derivatives of the outputs, zero where they are round-off.
 
@@ -281,27 +284,38 @@ def _of_run(fit: ModelFit, r: int, run: RunPredictor, p: Array) -> Array | Statu
     present = fit.predictor.runs[r]
     run.motions = present.known_motions()
     run.watched = False  # at the null nothing has moved
-    samples = run.evaluate_on(present, p)
-    if samples is not None and not (samples.status == Status.CONVERGED.value).all():
-        samples = None
-    known, dofs, again = run.motions.keys(), set(run.kernels.derived.dofs), None
-    if samples is None and set(present.kernels.derived.dofs) == known < dofs:
-        # All that has to be found are states of the candidate's own.
-        samples = run.follow(p)
-        again = None if samples is None else run.follow
-    if samples is None and len(p) == 1:
-        samples = run.evaluate(p[0])
-    elif samples is None:
-        status = _anchored(run, p)
-        if status is not Status.CONVERGED:
-            return status
-        samples = run.predict(p, derivatives=True)
+    found = _samples_of(present, run, p)
+    if isinstance(found, Status):
+        return found
+    samples, again = found
     solved = samples.status == Status.CONVERGED.value
     if solved.any() and not solved.all():
         return _of_two_parts(fit, r, run, p, solved)
     if not solved.all() or samples.y_p is None:
         return Status(int(samples.status.max()))
     return resolved_sensitivities(run, p, samples, _own(fit, run), again)
+
+
+def _samples_of(
+    present: RunPredictor, run: RunPredictor, p: Array
+) -> tuple[PredictedSamples, Again | None] | Status:
+    """The samples of a candidate by the first way that there is, and how to find them again from
+    elsewhere; or why there are none.
+
+    At the null it moves as the present model does, up to states of its own.
+    """
+    samples = run.evaluate_on(present, p)
+    if samples is not None and (samples.status == Status.CONVERGED.value).all():
+        return samples, None
+    if set(present.kernels.derived.dofs) == run.motions.keys() < set(run.kernels.derived.dofs):
+        # All that has to be found are states of the candidate's own.
+        samples = run.follow(p)
+        if samples is not None:
+            return samples, run.follow
+    if len(p) == 1:
+        return run.evaluate(p[0]), None
+    status = _anchored(run, p)
+    return (run.predict(p, derivatives=True), None) if status is Status.CONVERGED else status
 
 
 def _anchored(run: RunPredictor, p: Array) -> Status:
