@@ -566,8 +566,8 @@ class TaskPool(Protocol):
         """Calls that are made at a time; none for now where it is zero."""
 
     @property
-    def alive(self) -> bool:
-        """Whether calls are still taken."""
+    def lost(self) -> str:
+        """Why no calls are taken any more; empty while they are."""
 
     def submit(self, function: Callable[[Path], Any]) -> Pending:
         """Begin a call."""
@@ -582,7 +582,7 @@ class OwnProcesses:
         How many at a time.
     """
 
-    alive = True
+    lost = ""
 
     def __init__(self, jobs: int) -> None:
         self.size, self._stop = jobs, threading.Event()
@@ -613,12 +613,18 @@ class Machines:
     def __init__(self, client: Client) -> None:
         self.client = client
         self._size, self._counted = 1, -math.inf
+        self._manned = time.monotonic()
         self._begun: weakref.WeakSet[Any] = weakref.WeakSet()
 
     @property
-    def alive(self) -> bool:
-        """Whether the scheduler answers, or may again."""
-        return self.client.status in ("running", "connecting")
+    def lost(self) -> str:
+        """Says so where the scheduler does not answer and will not again, or where no worker has
+        been there for long, as when all were lost and none began again."""
+        if self.client.status not in ("running", "connecting"):
+            return "the scheduler was lost"
+        if time.monotonic() - self._manned > WAIT:
+            return f"the scheduler has had no workers for {WAIT} seconds"
+        return ""
 
     @property
     def size(self) -> int:
@@ -628,7 +634,9 @@ class Machines:
         now = time.monotonic()
         if now - self._counted > self.COUNTED:
             with suppress(*UNCONNECTED):  # the scheduler is being lost
-                self._size = max(sum(self.client.nthreads().values()), 1)
+                threads = sum(self.client.nthreads().values())
+                self._size = max(threads, 1)
+                self._manned = now if threads else self._manned
             self._counted = now
         return self._size
 

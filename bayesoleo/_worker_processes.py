@@ -367,6 +367,7 @@ class Beside[S, R]:
         self._found: list[tuple[str, Any]] = []
         self._items: dict[int, Any] = {}
         self._answered, self._enough = threading.Event(), threading.Event()
+        self._dropped = False
         self._thread = threading.Thread(target=self._ask, daemon=True)
         self._thread.start()
 
@@ -393,8 +394,7 @@ class Beside[S, R]:
             Function, what all its calls need, and items of work as of :func:`process_map`, which
             the process goes on with until :meth:`taken` is called.
         """
-        jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
-        if not 1 < jobs <= cls.MOST or not usable() or not _in_use.acquire(blocking=False):
+        if not cls.may_begin(jobs) or not _in_use.acquire(blocking=False):
             return None
         try:
             more = [] if then is None else [(*then[:2], None), *((0, item) for item in then[2])]
@@ -406,9 +406,17 @@ class Beside[S, R]:
                 return None
             raise
 
+    @classmethod
+    def may_begin(cls, jobs: int | None = None) -> bool:
+        """Whether there are processes for it, in use or not; ``jobs`` as of :func:`process_map`."""
+        jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
+        return 1 < jobs <= cls.MOST and usable()
+
     def _ask(self) -> None:
         try:
             worker = process_of(0)
+            if self._dropped:  # before there was one to be ended
+                return
             worker.ask(sent((_called, self._function, None)))
             self._found.append(worker.ask(self._message))
             self._message = []
@@ -437,8 +445,10 @@ class Beside[S, R]:
             self.drop()
 
     def drop(self) -> None:
-        """End the process: nobody waits for what it does."""
-        kill_processes()
+        """End the process unless it is done: nobody waits for what it does."""
+        self._dropped = True
+        if self._thread.is_alive():
+            kill_processes()
         self._thread.join()
 
     def result(self) -> R:

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -232,11 +233,33 @@ def await_end(process):
         time.sleep(0.05)
 
 
+def test_workers_of_which_none_begins_again_are_not_waited_for_without_end(monkeypatch):
+    """All workers of a machine may be lost with what would begin them again."""
+    clock, threads = [0.0], {"a": 2}
+    monkeypatch.setattr(parallel.time, "monotonic", lambda: clock[0])
+    pool = Machines(SimpleNamespace(status="running", nthreads=lambda: threads))
+    assert (pool.size, pool.lost) == (2, "")
+    threads.clear()
+    for clock[0] in (100.0, parallel.WAIT - 1.0):
+        assert (pool.size, pool.lost) == (1, "")  # work is sent: one may be on its way
+    threads["b"] = 1
+    clock[0] += 2.5
+    assert (pool.size, pool.lost) == (1, "")
+    threads.clear()
+    clock[0] += parallel.WAIT
+    assert (pool.size, pool.lost) == (1, "")
+    clock[0] += 1.0
+    assert pool.lost == "the scheduler has had no workers for 300 seconds"
+    threads["c"] = 4  # looked at again
+    clock[0] += 2.0
+    assert (pool.size, pool.lost) == (4, "")
+
+
 @pytest.mark.slow
 def test_calls_on_a_cluster_have_processes_of_their_own(client, tmp_path):
     client.wait_for_workers(2, timeout=300)  # one that another test killed comes again
     pool = Machines(client)
-    assert (pool.size, pool.alive) == (2, True)
+    assert (pool.size, pool.lost) == (2, "")
     calls = [Noted(tmp_path, f"call-{k}") for k in range(3)]
     assert [one.result() for one in [pool.submit(call) for call in calls]] == [
         "call-0", "call-1", "call-2",
@@ -299,7 +322,7 @@ def test_a_scheduler_that_is_killed_is_noticed(monkeypatch, tmp_path):
             assert loss_of(caught.value).times == 0
             assert pool.size == 0
             deadline = time.monotonic() + 60
-            while pool.alive:
+            while not pool.lost:
                 assert time.monotonic() < deadline
                 time.sleep(0.1)
             pool.close()

@@ -393,6 +393,30 @@ def test_one_that_nobody_waits_for_is_ended(eager):
     assert processes.Beside.begun(where_and_twice, 5, 2).result()[1] == 10
 
 
+def test_a_process_that_is_done_is_not_ended(eager):
+    beside = processes.Beside.begun(where_and_twice, 5, 2)
+    pid, _ = beside.result()
+    beside.drop()
+    assert processes.Beside.begun(where_and_twice, 6, 2).result() == (pid, 12)
+
+
+def test_a_call_that_is_dropped_before_there_is_a_process_is_not_made(eager, monkeypatch):
+    rightly, begin = processes.process_of, threading.Event()
+
+    def late(number):
+        begin.wait(60.0)
+        return rightly(number)
+
+    monkeypatch.setattr(processes, "process_of", late)
+    beside = processes.Beside.begun(time.sleep, 60.0, 2)
+    threading.Timer(0.2, begin.set).start()
+    begun = time.monotonic()
+    beside.drop()
+    assert time.monotonic() - begun < 30.0  # a process is started at most
+    assert not processes._in_use.locked()
+    assert processes.Beside.begun(where_and_twice, 5, 2).result()[1] == 10
+
+
 @pytest.mark.parametrize("size", [3, 400], ids=["within the pickle", "beside it"])
 def test_arrays_come_as_they_were_and_are_their_owners(eager, size):
     rng = np.random.default_rng(3)

@@ -50,10 +50,11 @@ from bayesoleo._workflow.structures_beside import (
 from bayesoleo._workflow.task import Source, Task, prepare, silent
 from bayesoleo.discovery._compile_ahead import compile_meanwhile
 from bayesoleo.discovery._inference import CATALOGUE
-from bayesoleo.discovery._loop import Ahead as SearchAhead, ClosedLoop, close_loop, judged, loop_of
+from bayesoleo.discovery._loop import ClosedLoop, Provisional, close_loop, judged, loop_of
 from bayesoleo.discovery._next_experiment import check_aim
 from bayesoleo.discovery._open_questions import Question, questions_of
 from bayesoleo.discovery._round import Progress
+from bayesoleo.discovery._state import forget_bases
 from bayesoleo.discovery._work import QUICK
 from bayesoleo.effects._catalogue import catalogue, catalogue_titles, with_titles
 from bayesoleo.error_models._registry import AUTO
@@ -144,8 +145,11 @@ def close(
     _check_aim(task)
     stages, begun = Stages(callback), time.monotonic()
 
+    def is_long() -> bool:
+        return time.monotonic() - begun > WORTH_KEEPING
+
     def begin(loop: ClosedLoop) -> tuple[Groups | None, Beside[Asked, Answer] | None]:
-        if time.monotonic() - begun > WORTH_KEEPING:
+        if not settings.quick or is_long() or not Beside.may_begin(settings.jobs):
             return None, None
         known, shown = _shown_early(task, loop, output)
         return known, begun_beside(_asked_of(task, loop), shown, settings.jobs)
@@ -153,15 +157,14 @@ def close(
     with output.alone(), Early(begin, settings.jobs) as early:
         loop = run_loop(
             task, settings.max_effects, stages, output, resume=True,
-            ahead=early if settings.quick else None,
+            provisional=early if settings.quick else None,
         )  # fmt: skip
         # A search that took long is written with its probabilities before the draws.
-        long = time.monotonic() - begun > WORTH_KEEPING and not early.is_for(loop)
-        first = not settings.quick or long
-        known, beside = (None, None) if first else early.of(loop)
+        first = not settings.quick or is_long()
+        known, beside = early.of(loop)
         questions, groups, ahead, place = no_questions(), None, None, output.checkpoints
-        if beside is None:
-            found = answered(_asked_of(task, loop), callback)
+        if beside is None or first:
+            found = beside.result() if beside else answered(_asked_of(task, loop), callback)
             loop, questions = with_structures(task, loop, found, stages)
         if first:
             _write_found(task, loop, output, stages, questions)
@@ -174,8 +177,9 @@ def close(
             )
             if beside is not None:
                 groups = _groups_of(task, loop, drawn, stages, known)
-                callback("compare structures")
-                loop, questions = with_structures(task, loop, beside.result(), stages)
+                if not first:
+                    callback("compare structures")
+                    loop, questions = with_structures(task, loop, beside.result(), stages)
                 ahead = partial(pictures_of, beside)
         return written(task, loop, drawn, output, stages, questions, groups, ahead)
 
@@ -256,6 +260,7 @@ def draw_final(
     )
     if loop._scanned is not None:
         loop._scanned.drop()
+    forget_bases()
     return draw(task, final.fit, checkpoints, callback, progress, inference)
 
 
@@ -333,7 +338,7 @@ def run_loop(
     output: ResultFolder,
     *,
     resume: bool = False,
-    ahead: SearchAhead | None = None,
+    provisional: Provisional | None = None,
 ) -> ClosedLoop:
     """Rounds until nothing is missing, or nothing helps; the posterior is not sampled.
 
@@ -349,7 +354,7 @@ def run_loop(
         Written to after the estimate and after each round.
     resume : bool
         Whether to keep how far the search has come, and to go on from there.
-    ahead : callable, optional
+    provisional : callable, optional
         As of :func:`~bayesoleo.discovery._loop.close_loop`; where it is given, the probabilities of
         structures are left to :func:`with_structures`.
 
@@ -393,7 +398,7 @@ def run_loop(
             keep=keep,
             keep_columns=max_effects > 0 and settings.inference.error_model in (AUTO, CATALOGUE),
             declared=task.declared,
-            ahead=ahead,
+            provisional=provisional,
             callback=callback,
         )
     except Exception as error:

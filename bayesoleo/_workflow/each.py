@@ -157,7 +157,7 @@ def close_each(
         If there is no such campaign, model or scheduler, or the folder cannot be written to or is
         being written to; nothing was run then.
     UnfinishedError
-        If the scheduler was lost; the same call goes on.
+        If the scheduler was lost, or has had no workers for five minutes; the same call goes on.
 
     Examples
     --------
@@ -323,7 +323,7 @@ class Course:
         Raises
         ------
         UnfinishedError
-            If the scheduler is lost.
+            If the scheduler is lost, or has no workers for long.
         """
         waiting = deque(todo)
         try:
@@ -334,7 +334,7 @@ class Course:
                     for number, end in self._ended():
                         self._end(self.running.pop(number), end, waiting)
                     left = len(waiting) + len(self.running)
-                    if left and not self.pool.alive:
+                    if left and self.pool.lost:
                         raise self._lost(left)
         finally:
             self.book.save()
@@ -351,7 +351,7 @@ class Course:
     def _lost(self, left: int) -> UnfinishedError:
         are, them = ("is", "it") if left == 1 else ("are", "them")
         reason = (
-            f"the scheduler was lost; {number_of(left, 'task')} {are} left, and the same command"
+            f"{self.pool.lost}; {number_of(left, 'task')} {are} left, and the same command"
             f" does {them}"
         )
         return UnfinishedError([{"stage": "each", "reason": reason}], None, self.book.folder)

@@ -5,6 +5,7 @@ while this one draws from the posterior, which does not depend on them; then fig
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -122,14 +123,15 @@ def begun_beside(
 
 
 class Early[K]:
-    """The answer to what a search asks, begun before it is known whether the search has ended.
+    """The answer to what a search asks, begun before it is known whether its result stands.
 
-    Left by an exception, the other process is ended.
+    An exception that leaves it ends the other process.
 
     Parameters
     ----------
     begin : callable
-        Of a loop: anything to keep with the answer, and the answer as of :func:`begun_beside`.
+        Of a loop: anything to keep with the answer, and the answer as of :func:`begun_beside`. What
+        it raises is not passed on: what no other process does is done here.
     jobs : int, optional
         Processes, this one included.
     """
@@ -145,8 +147,10 @@ class Early[K]:
         self._beside: Beside[Asked, Answer] | None = None
 
     def __call__(self, loop: ClosedLoop) -> Callable[[], None]:
-        """Begin, for a search that may go on; returns :meth:`drop`."""
-        self._loop, (self._known, self._beside) = loop, self._begin(loop)
+        """Begin, for a result that may be replaced; returns :meth:`drop`."""
+        self._loop = loop
+        with suppress(Exception):
+            self._known, self._beside = self._begin(loop)
         return self.drop
 
     def drop(self) -> None:
@@ -155,10 +159,6 @@ class Early[K]:
             self._beside.drop()
             start_ahead(jobs=self._jobs)
         self._loop = self._known = self._beside = None
-
-    def is_for(self, loop: ClosedLoop) -> bool:
-        """Whether the answer is on its way for this loop."""
-        return self._beside is not None and loop is self._loop
 
     def of(self, loop: ClosedLoop) -> tuple[K | None, Beside[Asked, Answer] | None]:
         """What was begun for this loop, or is now."""

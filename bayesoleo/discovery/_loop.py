@@ -301,8 +301,8 @@ class ClosedLoop:
         )
 
 
-#: Takes a result that may not stand, and gives what to call where it does not.
-type Ahead = Callable[[ClosedLoop], Callable[[], None]]
+#: Receives a result that may be replaced. Returns a function to call when it may be.
+type Provisional = Callable[[ClosedLoop], Callable[[], None]]
 
 
 @single_blas_thread()  # matrices are small: threads take longer to meet than to work
@@ -321,7 +321,7 @@ def close_loop(
     keep: Callable[[Progress], None] = lambda _: None,
     keep_columns: bool = False,
     declared: ModelFit | None = None,
-    ahead: Ahead | None = None,
+    provisional: Provisional | None = None,
     callback: ProgressCallback = lambda _: None,
 ) -> ClosedLoop:
     """Fit a model and add the effects that it lacks, one after the other.
@@ -357,10 +357,10 @@ def close_loop(
     declared : ModelFit, optional
         The declared model's estimate, if it was made before: by :func:`fit_model`, by these runs
         and numerics.
-    ahead : callable, optional
+    provisional : callable, optional
         Where it is given, the caller compares structures, by :func:`structures_of` and
         :func:`judged`: no estimate depends on that. It receives the result that stands unless
-        another first effect leads as far. What it returns is called where the search is done again
+        another first effect does better. What it returns is called where the search is done again
         with another one.
     callback : callable
         Receives a message at each step.
@@ -397,12 +397,12 @@ def close_loop(
         # What it would have found is not among what probabilities are of.
         return loop_of(known.ended(ENDED), roles)
     loop = replace(loop_of(known, roles), without_structures=known)
-    if ahead is not None:
-        drop = ahead(loop)
+    if provisional is not None:
+        drop = provisional(loop)
     best = best_of_beam(known, roles, numerics, follow, effects, max_effects, callback)
     if best is not known:
         loop = replace(loop_of(best, roles), without_structures=best)
-    if ahead is not None:
+    if provisional is not None:
         return loop
     return judged(loop, structures_of(best, numerics, prior, callback))
 

@@ -41,7 +41,7 @@ LEAST = 1e-8
 #: Sums of products over some 1e5 samples are good to this part of the size of what they sum.
 ROUND_OFF = 1e3 * float(np.finfo(float).eps)
 
-#: Samples at some constants, near others at which they were found in the same way.
+#: Finds samples at other constants, near those at which they were found, in the same way.
 type Again = Callable[[Array], PredictedSamples | None]
 
 #: A sensitivity is computed again if a parameter that moves a state by its full size moves an

@@ -14,7 +14,7 @@ import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -200,35 +200,52 @@ class State:
 
 
 class _Bases:
-    """Bases of the states that were asked for last: a round, what it adds and what confirms that
-    begin with the same ones. Each may hold hundreds of columns of a record."""
+    """Bases of the states that were asked for last, which go with their states.
 
+    A round, the elimination after it and the confirmation use the same base.
+    """
+
+    #: Each may hold hundreds of columns of a record.
     MOST = 2
 
     def __init__(self) -> None:
         self.kept = OrderedDict[int, tuple[weakref.ref[State], Base]]()
-        self.lock = threading.Lock()
+        # A state may go while this thread holds it: then the thread asks again.
+        self.lock = threading.RLock()
 
     def of(self, state: State) -> Base:
         """The base of a state, kept or made now."""
+        number = id(state)
         with self.lock:
-            known = self.kept.get(id(state))
-            if known is not None and known[0]() is state:  # not of another one that is gone
-                self.kept.move_to_end(id(state))
-                return known[1]
+            if number in self.kept:
+                self.kept.move_to_end(number)
+                return self.kept[number][1]
         fit = for_comparison(state.fit)
         entries = {(entry.run, entry.output): entry for entry in state.fit_errors.entries}
         base = base_of(fit, entries)
         with self.lock:
-            self.kept[id(state)] = weakref.ref(state), base
-            self.kept.move_to_end(id(state))
-            gone = [key for key, (one, _) in self.kept.items() if one() is None]
-            for key in gone or list(self.kept)[: -self.MOST]:
-                del self.kept[key]
+            self.kept[number] = weakref.ref(state, partial(self._forget, number)), base
+            while len(self.kept) > self.MOST:
+                self.kept.popitem(last=False)
         return base
+
+    def _forget(self, number: int, _: object) -> None:
+        """Of a state that is no more, before another one has its number."""
+        with self.lock:
+            self.kept.pop(number, None)
+
+    def clear(self) -> None:
+        """Forget all."""
+        with self.lock:
+            self.kept.clear()
 
 
 _bases = _Bases()
+
+
+def forget_bases() -> None:
+    """Free the memory of all bases that are kept."""
+    _bases.clear()
 
 
 def state_of(assembly: Assembly, fit: ModelFit, roles: Roles) -> State:

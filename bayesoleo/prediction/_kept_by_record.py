@@ -1,4 +1,4 @@
-"""Arrays that follow from a run alone and are asked for by each model of it."""
+"""Arrays that follow from a run, or from a model of it, and are asked for again and again."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ class KeptByRecord:
         self._bytes = 0
 
     def of(self, record: Record, key: Hashable, make: Callable[[], Array]) -> Array:
-        """What is kept of a run under a key, or is made of it now; not to be written to."""
+        """What is kept of a run under a key, or is made of it now; not to be written to. Nothing
+        without a number is kept: no limit would end that."""
         full = id(record), key
         with self.lock:
             if full in self.kept:
@@ -37,6 +38,8 @@ class KeptByRecord:
                 return self.kept[full]
         found = make()
         found.flags.writeable = False
+        if not found.size:
+            return found
         with self.lock:
             if full[0] not in self.runs:
                 self.runs[full[0]] = weakref.ref(record, partial(self._forget, full[0]))

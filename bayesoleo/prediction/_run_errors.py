@@ -22,7 +22,6 @@ from typing import Protocol, cast
 import numpy as np
 
 from bayesoleo._types import Array, ComplexArray, Flags, Integers
-from bayesoleo.model._kernels import Structured
 from bayesoleo.prediction._band_limited import Smoothed
 from bayesoleo.prediction._inputs import (
     harmonics_of,
@@ -56,6 +55,8 @@ TOLERANCE = 1e-6
 LOOKS = 16_384
 #: Bytes of draws, and of changes by harmonics, that are kept for the next model of a run.
 MOST_KEPT = 3e8
+#: The same of columns.
+MOST_COLUMNS = 1.5e8
 #: Coefficients of an input for which states are solved together.
 TOGETHER = 32
 
@@ -82,27 +83,26 @@ def input_columns(run: RunPredictor, p: Array, draws: int = DRAWS) -> Array:
         solved. Not to be written to: those of a periodic run are kept.
     """
     ny, samples = run.measured.shape
-    x, z = np.empty((1, 0, 0)), np.empty((1, 0, samples))
+    x = np.empty((1, 0, 0))
     if run.kernels.derived.dofs:
         solution = run.solve(p[None])
         if solution.status[0] != Status.CONVERGED.value:
             return np.zeros((ny, 0, samples))
         x = solution.x
-        z = run.scheme.sample(x[..., None], run.plan, run.boundary.step(run.steps))[:, :, 0]
     if not run.record.periodic:
-        return _columns_about(run, p, x, z, draws)
-    mesh = getattr(run.scheme, "mesh", None)
-    edges = b"" if mesh is None else mesh.edges.tobytes()
-    like = Structured(run.model), run.kernels.derived.active, run.scheme_name, run.steps, edges
-    key = like, draws, MOST_LINES, p.tobytes(), hashlib.sha256(x.tobytes()).digest()
-    # A search asks for the same ones again: for errors, for scores and where it confirms.
-    return _of_records.of(run.record, key, lambda: _columns_about(run, p, x, z, draws))
+        return _columns_about(run, p, x, draws)
+    like = run.model.structure, run.kernels.derived.active, run.scheme_name, run.steps, MOST_LINES
+    key = like, p.tobytes(), hashlib.sha256(x.tobytes()).digest()
+    return _columns.of(run.record, key, lambda: _columns_about(run, p, x, draws))
 
 
-def _columns_about(run: RunPredictor, p: Array, x: Array, z: Array, draws: int) -> Array:
-    """The columns at a solution ``x`` with the rows ``z`` at the samples."""
+def _columns_about(run: RunPredictor, p: Array, x: Array, draws: int) -> Array:
+    """The columns at a solution ``x``."""
     derived = run.kernels.derived
     ny, samples = run.measured.shape
+    z = np.empty((1, 0, samples))
+    if derived.dofs:
+        z = run.scheme.sample(x[..., None], run.plan, run.boundary.step(run.steps))[:, :, 0]
     lanes, one = np.zeros(1, dtype=np.int64), p[None]
     yz, yp = np.zeros((1, ny, z.shape[1], samples)), np.zeros((1, ny, len(derived.active), samples))
     yu = np.zeros((1, ny, len(derived.inputs), samples))
@@ -380,10 +380,13 @@ class _Draws:
 _errors = _Draws(MOST_KEPT)
 
 
-#: Of a broadband input changes by its harmonics take as long as the states of a model, the input at
-#: all points at which equations are looked at takes as long as the look, and the changes of a
-#: model's outputs as long as some of the fits that they are compared with.
+#: Of a broadband input changes by its harmonics take as long as the states of a model, and the
+#: input at all points at which equations are looked at takes as long as the look.
 _of_records = KeptByRecord(MOST_KEPT)
+#: Changes of the outputs by these. A round, and what confirms its effect, begin with the estimate
+#: of the last one, and ask again where its solution is the same in all digits. In a store of their
+#: own: those of many models would drive out what each model asks for.
+_columns = KeptByRecord(MOST_COLUMNS)
 
 
 def _changes_of(

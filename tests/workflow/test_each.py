@@ -304,14 +304,17 @@ def test_campaigns_of_one_name_keep_their_folders_in_any_order(loops, tmp_path):
 # -- by value ---------------------------------------------------------------------------
 
 
+WHY = "the scheduler was lost, or has no workers"
+
+
 class Remote(OwnProcesses):
     """A cluster that is lost after so many tasks."""
 
     left = 10**9
 
     @property
-    def alive(self) -> bool:
-        return self.left > 0
+    def lost(self) -> str:
+        return "" if self.left > 0 else WHY
 
     def submit(self, function):
         self.left -= 1
@@ -372,7 +375,7 @@ def test_a_campaign_whose_files_have_whole_paths_is_sent_as_it_was_read(
 def test_a_lost_scheduler_leaves_a_manifest_that_goes_on(loops, remote, campaigns, tmp_path):
     out = tmp_path / "all"
     remote["left"] = 2
-    with pytest.raises(UnfinishedError, match="the scheduler was lost") as caught:
+    with pytest.raises(UnfinishedError, match=WHY) as caught:
         close_each(campaigns, law("a"), out=out, seeds=3, scheduler="tcp://x:1")
     states = Counter(task["state"] for task in manifest(out).values())
     assert states["done"] <= 2

@@ -10,12 +10,13 @@ import pytest
 import xarray as xr
 from small_campaigns import damper, damper_campaign
 
-from bayesoleo import _schema as schema
+from bayesoleo import _schema as schema, _worker_processes
 from bayesoleo._workflow import closing, structures_beside
 from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.structures_beside import Early
 from bayesoleo.discovery import _loop
 from bayesoleo.effects import find_effect
+from bayesoleo.errors import UnfinishedError
 
 EFFECTS = tuple(map(find_effect, ("coulomb_friction", "quintic_stiffness", "constant_force")))
 SETTINGS = Settings(seed=5, quick=True, effects=EFFECTS, jobs=2)
@@ -39,7 +40,6 @@ def early(monkeypatch):
 def test_what_was_begun_for_the_loop_that_stands_is_taken(early):
     begun, events = early
     begun("a")
-    assert begun.is_for("a")
     known, beside = begun.of("a")
     assert (known, beside.name) == ("known a", "a")
     assert events == ["begin a"]
@@ -48,7 +48,6 @@ def test_what_was_begun_for_the_loop_that_stands_is_taken(early):
 def test_what_was_begun_for_another_loop_is_ended(early):
     begun, events = early
     begun("a")
-    assert not begun.is_for("b")
     known, beside = begun.of("b")
     assert (known, beside.name) == ("known b", "b")
     assert events == ["begin a", "end", "ready", "begin b"]
@@ -60,14 +59,12 @@ def test_it_is_dropped_once_and_a_process_made_ready_meanwhile(early):
     drop()
     drop()
     assert events == ["begin a", "end", "ready"]
-    assert not begun.is_for("a")
     assert begun.of("a")[0] == "known a"  # begun again
 
 
 def test_what_no_process_can_do_is_not_begun_twice(early):
     begun, events = early
     begun("c")
-    assert not begun.is_for("c")
     assert begun.of("c") == ("known c", None)
     assert events == ["begin c"]
 
@@ -86,6 +83,15 @@ def test_nothing_goes_on_where_the_search_is_left_by_an_error(early):
     assert events == ["begin a", "end"]
     search(False)
     assert events[2:] == ["begin a"]
+
+
+def test_what_cannot_be_begun_is_left_to_the_caller(monkeypatch):
+    def begin(_loop):
+        raise RuntimeError("can't start new thread")
+
+    begun = Early(begin, 2)
+    begun("a")
+    assert begun.of("a") == (None, None)
 
 
 @pytest.fixture(scope="module")
@@ -126,3 +132,40 @@ def test_results_are_the_same_where_it_is_begun_early(campaign, tmp_path, monkey
     one.pop("files"), two.pop("files")
     assert one == two
     xr.testing.assert_equal(tree["posterior"].to_dataset(), alone["posterior"].to_dataset())
+
+
+@pytest.mark.parametrize("fails", [False, True], ids=["ends", "breaks off"])
+def test_what_took_long_is_written_before_the_draws(campaign, tmp_path, monkeypatch, fails):
+    """Also where structures were begun before a search took long with other first effects."""
+    monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
+    events: list[str] = []
+    now, late = closing.time.monotonic, [0.0]
+    monkeypatch.setattr(closing.time, "monotonic", lambda: now() + late[0])
+
+    def beam(progress, *_):
+        late[0] = closing.WORTH_KEEPING
+        if fails:
+            raise RuntimeError("it broke")
+        return progress
+
+    def noted(name):
+        rightly = getattr(closing, name)
+
+        def call(*given, **named):
+            events.append(name)
+            return rightly(*given, **named)
+
+        monkeypatch.setattr(closing, name, call)
+
+    monkeypatch.setattr(_loop, "best_of_beam", beam)
+    for name in ("begun_beside", "with_structures", "_write_found", "draw"):
+        noted(name)
+    expected = ["begun_beside", "with_structures", "_write_found", "draw"]
+    if fails:
+        with pytest.raises(UnfinishedError, match="it broke"):
+            closing.close(campaign, damper(), SETTINGS, out=tmp_path)
+    else:
+        tree = closing.close(campaign, damper(), SETTINGS, out=tmp_path)
+        assert json.loads(tree.attrs[schema.SUMMARY])["structures"]["effects"]
+    assert events == expected
+    assert not _worker_processes._in_use.locked()
