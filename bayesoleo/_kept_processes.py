@@ -23,6 +23,8 @@ from bayesoleo._process_messages import Message, dumps, loads, receive, send
 
 #: Seconds without work after which a process ends.
 IDLE = 120.0
+#: Seconds to wait for the end of one that was killed.
+ENDING = 5.0
 #: It finds modules where its parent finds them, and does not run the user's script again.
 _CHILD = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]);"
@@ -114,8 +116,12 @@ def forget(number: int) -> None:
 
 def kill_processes() -> None:
     """Kill all processes that are kept; whoever waits for one finds it lost."""
-    for worker in list(kept.values()):
-        worker.process.kill()
+    killed = [worker.process for worker in list(kept.values())]
+    for process in killed:
+        process.kill()
+    for process in killed:  # one that is still ending would be taken for one that can be asked
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(ENDING)
 
 
 @atexit.register

@@ -164,6 +164,16 @@ def test_the_work_of_a_lost_process_is_done_here(eager):
     assert process_map(kills_its_process, os.getpid(), range(12), 2) == list(range(12))
 
 
+def test_processes_that_were_killed_are_not_asked_again(eager):
+    first = kept_processes.process_of(0)
+    for _ in range(3):
+        killed = kept_processes.process_of(0)
+        kept_processes.kill_processes()
+        assert kept_processes.process_of(0) is not killed
+    assert first.process.returncode == -signal.SIGKILL
+    kept_processes.process_of(0).ask(messages.dumps((None, None, None)))
+
+
 class UnknownElsewhere:
     """Cannot be read by another process."""
 

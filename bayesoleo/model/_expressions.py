@@ -306,7 +306,7 @@ def _slip(text: str) -> str:
         return f"a product needs *: write {left}*{right} for {missing[0]}"
     if text.count("(") != text.count(")"):
         return f"there are {text.count('(')} ( and {text.count(')')} )"
-    return "write it as in Python, e.g. k*q**3"
+    return _AS_IN_PYTHON
 
 
 class _Builder(ast.NodeVisitor):

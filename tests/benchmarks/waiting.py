@@ -2,8 +2,10 @@
 
 Each command runs in a process and a folder of its own. ``close_cold_extra_s`` is what an empty
 cache of compiled code adds, ``first_word_s`` the time to the first line or bar that a user sees.
-Times are those of this machine now; solves are CPU times of one thread. ``transient_ratio`` needs
-CasADi: see ``transients.py``. Run as
+Times are those of this machine now; solves are CPU times of one thread. ``yardstick_s`` is the time
+of a fixed calculation in Python, before the commands and after them: a machine that others use took
+twice as long for all of them on one day as on another. ``transient_ratio`` needs CasADi: see
+``transients.py``. Run as
 ``python tests/benchmarks/waiting.py --json``, with the data found through ``BAYESOLEO_DATA``.
 """
 
@@ -57,9 +59,18 @@ def waited(arguments: Sequence[str], folder: Path, more: Mapping[str, str]) -> t
     return seen, time.perf_counter() - begin
 
 
+def yardstick() -> float:
+    """Seconds of ten million additions in Python."""
+    begin, total = time.perf_counter(), 0
+    for k in range(10_000_000):
+        total += k
+    assert total == 49_999_995_000_000
+    return time.perf_counter() - begin
+
+
 def commands(say: Callable[[str], object]) -> dict[str, float]:
     """Seconds of whole commands."""
-    table: dict[str, float] = {}
+    table, before = dict[str, float](), yardstick()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         cache = {"BAYESOLEO_CACHE": str(folder / "cache"), "NUMBA_CACHE_DIR": str(folder / "numba")}
@@ -80,7 +91,7 @@ def commands(say: Callable[[str], object]) -> dict[str, float]:
             line = ["close", str(SILVERBOX / "silverbox"), "--model", str(model), "--quick"]
             _, table["silverbox_s"] = waited([*line, "--out", "silverbox"], folder, {})
             say(f"silverbox: {table['silverbox_s']:.1f} s")
-    return table
+    return table | {"yardstick_s": (before + yardstick()) / 2}
 
 
 def solves() -> dict[str, float]:
