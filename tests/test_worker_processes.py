@@ -482,6 +482,7 @@ def begun_at(shared, item):
 
 
 def test_what_takes_long_is_begun_first_and_here(eager):
+    processes.Beside.begun(where_and_twice, 1, 2).result()  # it has loaded this module
     items = [0.02] * 12 + [0.3] + [0.02] * 12 + [0.2]
     found = process_map(begun_at, None, items, 2, cost=lambda item: item)
     here = [(begun, k) for k, (pid, begun) in enumerate(found) if pid == os.getpid()]
