@@ -613,16 +613,17 @@ class Machines:
     def __init__(self, client: Client) -> None:
         self.client = client
         self._size, self._counted = 1, -math.inf
-        self._manned = time.monotonic()
+        self._empty_since: float | None = None
         self._begun: weakref.WeakSet[Any] = weakref.WeakSet()
 
     @property
     def lost(self) -> str:
-        """Says so where the scheduler does not answer and will not again, or where no worker has
-        been there for long, as when all were lost and none began again."""
+        """Says so where the scheduler does not answer and will not again, or where no look has
+        found a worker for long, as when all were lost and none began again."""
         if self.client.status not in ("running", "connecting"):
             return "the scheduler was lost"
-        if time.monotonic() - self._manned > WAIT:
+        # After a look now: to prepare and send many tasks may have taken long.
+        if self.size and self._empty_since and time.monotonic() - self._empty_since > WAIT:
             return f"the scheduler has had no workers for {WAIT} seconds"
         return ""
 
@@ -636,7 +637,7 @@ class Machines:
             with suppress(*UNCONNECTED):  # the scheduler is being lost
                 threads = sum(self.client.nthreads().values())
                 self._size = max(threads, 1)
-                self._manned = now if threads else self._manned
+                self._empty_since = None if threads else self._empty_since or now
             self._counted = now
         return self._size
 

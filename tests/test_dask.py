@@ -235,23 +235,27 @@ def await_end(process):
 
 def test_workers_of_which_none_begins_again_are_not_waited_for_without_end(monkeypatch):
     """All workers of a machine may be lost with what would begin them again."""
-    clock, threads = [0.0], {"a": 2}
+    clock, threads = [10.0], {"a": 2}
     monkeypatch.setattr(parallel.time, "monotonic", lambda: clock[0])
     pool = Machines(SimpleNamespace(status="running", nthreads=lambda: threads))
     assert (pool.size, pool.lost) == (2, "")
+    clock[0] += 10.0 * parallel.WAIT  # in which tasks were prepared, and nobody looked
+    assert pool.lost == ""
     threads.clear()
-    for clock[0] in (100.0, parallel.WAIT - 1.0):
-        assert (pool.size, pool.lost) == (1, "")  # work is sent: one may be on its way
+    clock[0] += 10.0 * parallel.WAIT
+    assert pool.lost == ""  # the first look that finds none
+    clock[0] += parallel.WAIT - 1.0
+    assert (pool.size, pool.lost) == (1, "")  # work is sent: a worker may be on its way
     threads["b"] = 1
     clock[0] += 2.5
     assert (pool.size, pool.lost) == (1, "")
     threads.clear()
-    clock[0] += parallel.WAIT
-    assert (pool.size, pool.lost) == (1, "")
-    clock[0] += 1.0
+    clock[0] += 2.5
+    assert pool.lost == ""
+    clock[0] += parallel.WAIT + 1.0
     assert pool.lost == "the scheduler has had no workers for 300 seconds"
-    threads["c"] = 4  # looked at again
-    clock[0] += 2.0
+    threads["c"] = 4
+    clock[0] += 2.5
     assert (pool.size, pool.lost) == (4, "")
 
 

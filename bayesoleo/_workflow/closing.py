@@ -164,6 +164,8 @@ def close(
         known, beside = early.of(loop)
         questions, groups, ahead, place = no_questions(), None, None, output.checkpoints
         if beside is None or first:
+            if beside is not None:  # else it is said as it begins
+                callback("compare structures")
             found = beside.result() if beside else answered(_asked_of(task, loop), callback)
             loop, questions = with_structures(task, loop, found, stages)
         if first:

@@ -55,7 +55,7 @@ TOLERANCE = 1e-6
 LOOKS = 16_384
 #: Bytes of draws, and of changes by harmonics, that are kept for the next model of a run.
 MOST_KEPT = 3e8
-#: The same of columns.
+#: Bytes of columns that are kept.
 MOST_COLUMNS = 1.5e8
 #: Coefficients of an input for which states are solved together.
 TOGETHER = 32
