@@ -368,8 +368,8 @@ class Beside[S, R]:
         self._items: dict[int, Any] = {}
         self._answered, self._enough = threading.Event(), threading.Event()
         self._dropped = False
+        self._freed = threading.Lock()
         self._thread = threading.Thread(target=self._ask, daemon=True)
-        self._thread.start()
 
     @classmethod
     def begun(
@@ -399,18 +399,33 @@ class Beside[S, R]:
         try:
             more = [] if then is None else [(*then[:2], None), *((0, item) for item in then[2])]
             taken = [as_it_is(sent(one)) for one in ((0, argument), *more)]
-            return cls(function, taken[0], taken[1:])
+            made = cls(function, taken[0], taken[1:])
         except BaseException as error:
             _in_use.release()
             if isinstance(error, LostError):
                 return None
             raise
+        made._start()
+        return made
 
     @classmethod
     def may_begin(cls, jobs: int | None = None) -> bool:
         """Whether there are processes for it, in use or not; ``jobs`` as of :func:`process_map`."""
         jobs = min(parallel.available_cores() if jobs is None else jobs, parallel.thread_limit())
         return 1 < jobs <= cls.MOST and usable()
+
+    def _start(self) -> None:
+        try:
+            self._thread.start()
+        except BaseException:  # an interrupt finds the thread at work, or about to be
+            self.drop()
+            self._free()
+            raise
+
+    def _free(self) -> None:
+        """Let others use the processes; the thread and what could not start it may both ask."""
+        if self._freed.acquire(blocking=False):
+            _in_use.release()
 
     def _ask(self) -> None:
         try:
@@ -427,7 +442,7 @@ class Beside[S, R]:
             forget(0)
         finally:
             self._answered.set()
-            _in_use.release()
+            self._free()
 
     def _go_on(self, worker: Worker) -> None:
         for number, message in enumerate(self._more):
@@ -449,7 +464,7 @@ class Beside[S, R]:
         self._dropped = True
         if self._thread.is_alive():
             kill_processes()
-        self._thread.join()
+            self._thread.join()
 
     def result(self) -> R:
         """What came of it, or the exception that it raised, when it is done."""

@@ -403,6 +403,34 @@ def test_one_that_nobody_waits_for_is_ended(eager):
     assert processes.Beside.begun(where_and_twice, 5, 2).result()[1] == 10
 
 
+def test_an_interrupt_while_it_begins_frees_the_processes_once(eager, monkeypatch):
+    start, errors = threading.Thread.start, []
+
+    def interrupted(thread):
+        start(thread)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(threading, "excepthook", errors.append)
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            processes.Beside.begun(time.sleep, 60.0, 2)
+    assert not errors  # a second release is one
+    assert not processes._in_use.locked()
+    assert processes.Beside.begun(where_and_twice, 5, 2).result()[1] == 10
+
+
+def test_a_thread_that_cannot_start_leaves_the_processes_free(eager, monkeypatch):
+    def refused(thread):
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", refused)
+        with pytest.raises(RuntimeError, match="new thread"):
+            processes.Beside.begun(time.sleep, 60.0, 2)
+    assert not processes._in_use.locked()
+
+
 def test_a_process_that_is_done_is_not_ended(eager):
     beside = processes.Beside.begun(where_and_twice, 5, 2)
     pid, _ = beside.result()
