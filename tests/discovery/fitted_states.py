@@ -18,7 +18,7 @@ from bayesoleo.model import Model
 from bayesoleo.prediction._records import Record
 
 #: NumPy's kernels need no compilation; one thread, for tests run side by side.
-NUMERICS = Numerics(jobs=1, backend="numpy")
+NUMERICS = Numerics(jobs=1)
 Array = NDArray[np.float64]
 
 

@@ -99,8 +99,17 @@ def campaign(tmp_path_factory):
     return damper_campaign(tmp_path_factory.mktemp("campaign"))
 
 
+@pytest.fixture(scope="module")
+def alone(campaign):
+    """What one process finds."""
+    return closing.close(campaign, damper(), replace(SETTINGS, jobs=1))
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("again", [False, True], ids=["stands", "done again"])
-def test_results_are_the_same_where_it_is_begun_early(campaign, tmp_path, monkeypatch, again):
+def test_results_are_the_same_where_it_is_begun_early(
+    campaign, alone, tmp_path, monkeypatch, again
+):
     """Also where a search that is done again takes its place, and the process is ended."""
     monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
     events: list[str] = []
@@ -127,13 +136,13 @@ def test_results_are_the_same_where_it_is_begun_early(campaign, tmp_path, monkey
     tree = closing.close(campaign, damper(), SETTINGS, out=tmp_path / "early")
     assert events[:2] == ["begin", "beam"]
     assert events[2:] == (["drop", "drop", "begin"] if again else [])
-    alone = closing.close(campaign, damper(), replace(SETTINGS, jobs=1))
     one, two = (json.loads(item.attrs[schema.SUMMARY]) for item in (tree, alone))
     one.pop("files"), two.pop("files")
     assert one == two
     xr.testing.assert_equal(tree["posterior"].to_dataset(), alone["posterior"].to_dataset())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fails", [False, True], ids=["ends", "breaks off"])
 def test_what_took_long_is_written_before_the_draws(campaign, tmp_path, monkeypatch, fails):
     """Also where structures were begun before a search took long with other first effects."""
