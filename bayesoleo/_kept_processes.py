@@ -25,6 +25,9 @@ from bayesoleo._process_messages import Message, dumps, loads, receive, send
 IDLE = 120.0
 #: Seconds to wait for the end of one that was killed.
 ENDING = 5.0
+#: Where optional libraries are missing, this one looks for its callers in all modules that are
+#: loaded: the later it comes, the longer that takes.
+EARLY = "arviz_base"
 #: It finds modules where its parent finds them, and does not run the user's script again.
 _CHILD = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]);"

@@ -19,6 +19,7 @@ from typing import Any, Self, cast
 
 import bayesoleo._parallel as parallel
 from bayesoleo._kept_processes import (
+    EARLY,
     ERROR,
     VALUE,
     LostError,
@@ -124,7 +125,7 @@ def _shared[S, T, R](
 
 
 #: What the processes of a search need to begin with.
-OF_A_SEARCH = ("bayesoleo.discovery._loop", "bayesoleo._report.page", "corner")
+OF_A_SEARCH = (EARLY, "bayesoleo.discovery._loop", "bayesoleo._report.page", "corner")
 
 
 def start_ahead(modules: Sequence[str] = OF_A_SEARCH, jobs: int | None = None) -> None:

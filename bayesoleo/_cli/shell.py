@@ -370,13 +370,13 @@ def begin(command: str, given: Mapping[str, Any], *, search: bool) -> None:
         of = f" {campaign}" if campaign is not None else ""
         complain(f"{command}{of}: loading libraries")
     from bayesoleo._first_compilation import begin_early
-    from bayesoleo._kept_processes import load
+    from bayesoleo._kept_processes import EARLY, load
     from bayesoleo._worker_processes import start_ahead
 
     jobs = given.get("jobs")
     if not begin_early(jobs) and search:
         start_ahead(jobs=jobs)
-    load(["bayesoleo._workflow.closing"])
+    load([EARLY, "bayesoleo._workflow.closing"])
 
 
 def console() -> Console:

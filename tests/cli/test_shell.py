@@ -86,6 +86,17 @@ def test_what_python_has_to_say_at_the_end_is_said(how, status, told):
     assert told in done.stderr
 
 
+def test_what_is_quicker_to_load_early_is_loaded_before_the_rest():
+    """Loaded while draws are judged it took four times as long, with a user waiting."""
+    text = (
+        "import sys; from bayesoleo._cli.shell import begin; begin('close', {'quiet': True},"
+        " search=False); names = list(sys.modules);"
+        " print(names.index('arviz_base') < names.index('bayesoleo._workflow.closing'))"
+    )
+    said = subprocess.run([sys.executable, "-c", text], capture_output=True, check=True, text=True)
+    assert said.stdout == "True\n"
+
+
 def test_what_nobody_reads_is_no_traceback():
     code = "import bayesoleo._cli as cli\ndef main(): print('x')\ncli.main = main; cli.run()"
     process = subprocess.Popen(

@@ -17,7 +17,7 @@ from bayesoleo.effects import find_effect
 from bayesoleo.model import Model
 from bayesoleo.prediction._records import Record
 
-#: NumPy's kernels need no compilation; one thread, for tests run side by side.
+#: One thread, for tests run side by side.
 NUMERICS = Numerics(jobs=1)
 Array = NDArray[np.float64]
 
