@@ -4,6 +4,7 @@ helpers from ``tests``."""
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return 2 if item.path.relative_to(root).parts[0] in UNCOMPILED else 3
 
     items.sort(key=turn)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Tests that are not begun by ``BAYESOLEO_TESTS_UNTIL``, seconds since 1970, are skipped."""
+    if time.time() > float(os.environ.get("BAYESOLEO_TESTS_UNTIL", "inf")):
+        pytest.skip("the time for tests is over (BAYESOLEO_TESTS_UNTIL)")
 
 
 @pytest.hookimpl(optionalhook=True)
