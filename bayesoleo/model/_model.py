@@ -427,7 +427,8 @@ class Model:
         if not self.parameters.keys() >= parameters.keys():
             other.__dict__.pop("structure", None)
         other._check_names()
-        check_units(other)
+        if any(name not in known or known[name].unit != p.unit for name, p in parameters.items()):
+            check_units(other)
         return other
 
     def with_term(self, kind: str, target: str, name: str, expression: Text) -> Model:

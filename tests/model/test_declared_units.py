@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
+import cloudpickle
 import pytest
 
 from bayesoleo._units import in_si
@@ -85,3 +89,16 @@ def test_a_name_that_results_use_is_refused_at_once(changes, name):
     plain = {"outputs": {"force": Output("1.0")}}
     with pytest.raises(ModelError, match=f"{name} has a name that results use.*rename it, for exa"):
         Model("law", **{**plain, **changes})
+
+
+def test_a_model_that_is_sent_on_is_not_checked_again(tmp_path):
+    """A process that is sent models would take a second to learn what units there are."""
+    (tmp_path / "model").write_bytes(cloudpickle.dumps(law()))
+    text = (
+        "import pickle, sys; model = pickle.load(open('model', 'rb'));"
+        " model.fixing('k'); model.with_parameters(k=model.parameters['k']);"
+        " print('pint' in sys.modules)"
+    )
+    line = [sys.executable, "-c", text]
+    said = subprocess.run(line, cwd=tmp_path, capture_output=True, check=True, text=True)
+    assert said.stdout == "False\n"
