@@ -260,7 +260,7 @@ def test_libraries_load_in_both_processes_of_a_search_at_once(
     monkeypatch.setattr(workflow, command, stopped)
     result = run(command, campaign, "--model", model, "--jobs", 2)
     assert result.stderr.splitlines()[-1] == "error: stop here"
-    loaded = ["bayesoleo._workflow.closing"]
+    loaded = [kept_processes.EARLY, "bayesoleo._workflow.closing"]
     assert begun == ([{"jobs": 2}, loaded] if command == "close" else [loaded])
     assert run(command, campaign / "nowhere", "--model", model).exit_code == 2
     assert len(begun) == (2 if command == "close" else 1)
