@@ -419,8 +419,10 @@ class Beside[S, R]:
         try:
             self._thread.start()
         except BaseException:  # an interrupt finds the thread at work, or about to be
-            self.drop()
-            self._free()
+            try:
+                self.drop()
+            finally:
+                self._free()
             raise
 
     def _free(self) -> None:
