@@ -21,6 +21,7 @@ import xarray as xr
 
 from bayesoleo import _schema as schema
 from bayesoleo._report.page import write_report
+from bayesoleo._report.page_figures import Part
 from bayesoleo._report.sentences import headline, response_entries
 from bayesoleo._report.terminal import write_plain_report
 from bayesoleo._storage.files import (
@@ -63,9 +64,9 @@ FILES = (RESULTS, REPORT, SUMMARY)
 #: Files and folders of which a process that was killed may have left a draft.
 SWEPT = (*FILES, "each.nc", "replications.nc", "campaign")
 CHECKPOINTS, SEARCH, OLDER = "checkpoints", "search.pickle", "older"
-#: Seconds between results of a search that goes on. One takes two or three to write, and the search
-#: goes on from what is kept besides.
-OFTEN = 20.0
+#: Seconds between results of a search that goes on. One takes two or three to write, a twentieth of
+#: that time, and the search goes on from what is kept besides.
+OFTEN = 60.0
 #: By this file a folder of an older result is known as one that was made here, and may go.
 PUT_ASIDE = ".put-aside"
 
@@ -304,7 +305,7 @@ def reason_of(error: Exception) -> str:
 
 Drawn = tuple[Samples, LogDensity]
 Groups = dict[str, xr.Dataset]
-Ahead = Callable[[], Mapping[str, list[Any]]]
+Ahead = Callable[[], Mapping[Part, list[Any]]]
 
 
 def write_result(
