@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import partial
 from typing import Any, cast
 
@@ -15,6 +15,7 @@ from bayesoleo.model._expressions import COSINE, SINE, TIME, WITHIN
 from bayesoleo.model._kernels import Kernels
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._inputs import RowCache, input_rows
+from bayesoleo.prediction._kept_by_record import KeptByRecord
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._stability import unstable_of
 from bayesoleo.prediction._starts import (
@@ -26,6 +27,7 @@ from bayesoleo.prediction._starts import (
     solve_from_shot,
 )
 from bayesoleo.prediction._sum_of_squares import FusedOutputs, squared_distances
+from bayesoleo.solvers._collocation import Collocation, SamplePlan
 from bayesoleo.solvers._orbit import Status
 from bayesoleo.solvers._periodic import (
     Boundary,
@@ -54,6 +56,8 @@ FIRST_DAMPED, WHOLE_STEPS, DAMPED_STEPS = 4, 200, 40
 #: differs from that motion by less than this part of its size about its mean, and another motion by
 #: more. A coordinate at rest may differ by this part of its value.
 FOLLOWING, KEPT, AT_REST = 40, 1e-3, 1e-9
+#: Plans of all models' samples, up to so many bytes.
+_plans = KeptByRecord(1e8)
 #: Threads share a run.
 _COUNTING = threading.Lock()
 
@@ -149,9 +153,24 @@ class RunPredictor:
             conditions=len(derived.admissible),
             active=len(derived.active),
         )
-        self.plan = self.scheme.plan(record.phase, steps) if derived.dofs else None
+        self.plan = self._plan_of_samples() if derived.dofs else None
         self.motions: dict[str, Motion] = {}
         self._observe(record.phase)
+
+    def _plan_of_samples(self) -> Any:
+        """Plan of the scheme for the samples, which all models of the run share."""
+        if not isinstance(self.scheme, Collocation):
+            return self.scheme.plan(self.record.phase, self.steps)
+
+        def made() -> Array:
+            plan = self.scheme.plan(self.record.phase, self.steps)
+            rows = [part[None] if part.ndim == 1 else part for part in astuple(plan)]
+            return np.concatenate(rows, dtype=float)
+
+        # Copies may be written to: kernels would compile once more for arrays that may not.
+        key = "plan", self.scheme_name, self.steps
+        index, position, *weights = _plans.of(self.record, key, made).copy()
+        return SamplePlan(index.astype(np.int64), position, *np.split(np.array(weights), 3))
 
     def _observe(self, position: Array) -> None:
         """What is measured, the inputs at the samples, and no solution yet."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -46,6 +46,27 @@ def known() -> Predictor:
     predictor = Predictor(free, [record], steps=64, backend="numpy", jobs=1)
     assert predictor.set_anchor(np.array([30.0])) == [Status.CONVERGED]
     return predictor
+
+
+@pytest.mark.parametrize("scheme", ["radau3", "gauss2", "thesis"])
+def test_models_of_a_run_share_the_plan_of_its_samples(known, scheme):
+    """What is kept is what the scheme plans, bit by bit, and each model has its own copy."""
+    (record,) = known.records
+    runs = [
+        Predictor(model, [record], steps=steps, scheme=scheme, backend="numpy", jobs=1).runs[0]
+        for model, steps in ((known.model, 64), (EXTENDED, 64), (EXTENDED, 80))
+    ]
+    for one in runs:
+        planned = one.scheme.plan(record.phase, one.steps)
+        for field in fields(planned):
+            here, there = getattr(one.plan, field.name), getattr(planned, field.name)
+            assert here.dtype == there.dtype
+            np.testing.assert_array_equal(here, there)
+            # Compiled code would be compiled once more for other arrays.
+            assert here.flags.c_contiguous
+            assert here.flags.writeable
+    first, second = (getattr(one.plan, field.name) for one in runs[:2])
+    assert not np.shares_memory(first, second)
 
 
 def extension(known: Predictor, model: Model, **sets: list[float]):
