@@ -19,7 +19,9 @@ from bayesoleo._report import sections
 from bayesoleo._report.sections import encode_formula
 from bayesoleo._worker_processes import process_map
 
-Maker = Callable[[xr.DataTree], list[Any]]
+Maker = Callable[[xr.DataTree], list[Callable[[], Any]]]
+#: A kind of figure, and a number among those of this kind.
+Part = tuple[str, int]
 
 
 def figures_of(
@@ -27,18 +29,34 @@ def figures_of(
     summary: dict[str, Any],
     drawing: sections.Drawing,
     before: Callable[[], object],
-    ahead: Callable[[], Mapping[str, list[Any]]] | None,
+    ahead: Callable[[], Mapping[Part, list[Any]]] | None,
 ) -> dict[str, list[Any]]:
     """All that is drawn, by its place on the page; in several processes."""
-    makers, known = _makers(summary), dict[str, list[Any]]()
+    known = dict[Part, list[Any]]()
     if ahead is not None:
         before()  # the other process goes on drawing meanwhile
         known = dict(ahead())
-        makers = {name: maker for name, maker in makers.items() if name not in known}
+    makers = _makers(summary)
+    every = _parts(tree, makers, drawing)
+    left = [part for part in every if part not in known]
+    items = [(*makers[kind], number) for kind, number in left]
     first = before if ahead is None else lambda: None
-    found = process_map(_draw, shared_by(tree), list(makers.values()), before=first)
-    drawing.failed += [text for _, failed in found for text in failed]
-    return known | {name: drawn for name, (drawn, _) in zip(makers, found, strict=True)}
+    found = process_map(_draw, shared_by(tree), items, before=first)
+    drawing.failed += dict.fromkeys(text for _, failed in found for text in failed)
+    known |= {part: drawn for part, (drawn, _) in zip(left, found, strict=True)}
+    return {
+        kind: [one for part in every if part[0] == kind for one in known[part]] for kind in makers
+    }
+
+
+def _parts(
+    tree: xr.DataTree, makers: Mapping[str, tuple[str, Maker]], drawing: sections.Drawing
+) -> list[Part]:
+    """All parts of all kinds in their order."""
+    counts = {
+        kind: len(drawing.of(words, partial(make, tree))) for kind, (words, make) in makers.items()
+    }
+    return [(kind, number) for kind, count in counts.items() for number in range(count)]
 
 
 def shared_by(tree: xr.DataTree) -> tuple[xr.DataTree, dict[str, Any]]:
@@ -46,19 +64,26 @@ def shared_by(tree: xr.DataTree) -> tuple[xr.DataTree, dict[str, Any]]:
     return tree, _drawing_settings()
 
 
-def draw_ahead(shared: tuple[xr.DataTree, Mapping[str, Any]], kind: str) -> list[Any] | None:
-    """Figures of one kind, which need neither draws nor a summary; None where they cannot be
-    drawn.
+def parts_ahead(tree: xr.DataTree) -> list[Part]:
+    """What :func:`draw_ahead` can draw of a tree."""
+    return _parts(tree, WITHOUT_DRAWS, sections.Drawing())
+
+
+def draw_ahead(
+    shared: tuple[xr.DataTree, Mapping[str, Any]], part: Part
+) -> tuple[Part, list[Any]] | None:
+    """One figure, which needs neither draws nor a summary, or none; None where that fails.
 
     Parameters
     ----------
     shared : tuple
         Of :func:`shared_by`.
-    kind : str
-        One of :data:`WITHOUT_DRAWS`.
+    part : (str, int)
+        Of a kind in :data:`WITHOUT_DRAWS`.
     """
-    drawn, failed = _draw(shared, WITHOUT_DRAWS[kind])
-    return None if failed else drawn
+    kind, number = part
+    drawn, failed = _draw(shared, (*WITHOUT_DRAWS[kind], number))
+    return None if failed else (part, drawn)
 
 
 def _makers(summary: dict[str, Any]) -> dict[str, tuple[str, Maker]]:
@@ -95,21 +120,30 @@ def _drawing_settings() -> dict[str, Any]:
 
 
 def _draw(
-    shared: tuple[xr.DataTree, Mapping[str, Any]], item: tuple[str, Maker]
+    shared: tuple[xr.DataTree, Mapping[str, Any]], item: tuple[str, Maker, int]
 ) -> tuple[list[Any], list[str]]:
-    """Figures of one kind, and what could not be drawn; also in another process."""
-    (tree, settings), (words, make), drawing = shared, item, sections.Drawing()
+    """One figure of a kind or none, and what could not be drawn; also in another process."""
+    (tree, settings), (words, make, number), drawing = shared, item, sections.Drawing()
+
+    def draw() -> list[Any]:
+        found = make(tree)[number]()
+        return [] if found is None else [found]
+
     now: Mapping[Any, Any] = matplotlib.rcParams
     other = {key: value for key, value in settings.items() if now[key] != value}
     # Settings are the whole process's: here, where they hold already, none is touched.
     with matplotlib.rc_context(cast(Any, other)) if other else nullcontext():
-        return drawing.of(words, partial(make, tree)), drawing.failed
+        return drawing.of(words, draw), drawing.failed
 
 
-def _formulas(tree: xr.DataTree) -> list[dict[str, Any]]:
+def _formulas(tree: xr.DataTree) -> list[Callable[[], dict[str, Any]]]:
     """Every formula as a picture, or as it is written where it cannot be drawn."""
     texts = json.loads(tree.attrs.get(schema.EQUATIONS_LATEX, "[]"))
-    return [{"latex": text, "image": encode_formula(text)} for text in texts]
+    return [partial(_formula, text) for text in texts]
+
+
+def _formula(text: str) -> dict[str, Any]:
+    return {"latex": text, "image": encode_formula(text)}
 
 
 #: What is drawn, in words, and the function that draws it, of the data and of the search alone.

@@ -1,4 +1,4 @@
-"""Figures of the report with their captions; those without data are left out.
+"""Figures of the report with their captions, a call for each; those without data are left out.
 
 Figures and formulas are embedded as ``<img>`` with their data: SVG inside the page would share its
 ids between figures.
@@ -151,30 +151,33 @@ class Drawing:
 
     failed: list[str] = field(default_factory=list)
 
-    def of[Drawn](self, what: str, draw: Callable[[], list[Drawn]]) -> list[Drawn]:
-        """The figures of one kind; none where one of them fails."""
+    def of[Found](self, what: str, draw: Callable[[], list[Found]]) -> list[Found]:
+        """What a function gives; nothing where it fails."""
         try:
             return draw()
         except Exception as error:
             reason = " ".join(f"{type(error).__name__}: {error}".split())
-            self.failed.append(f"The figure of {what} could not be drawn. {reason}")
+            said = f"The figure of {what} could not be drawn. {reason}"
+            self.failed += [said] if said not in self.failed else []
             return []
 
 
 Draw = Callable[[], Figure]
+#: Draws one figure of a kind; None where there is nothing to show.
+Drawn = Callable[[], CaptionedFigure | None]
 
 LOOPS: tuple[Against, ...] = ("velocity", "stroke")
 
 
-def data_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
+def data_figures(tree: xr.DataTree) -> list[Drawn]:
     """The records."""
     caption = (
         f"The records as measured{averaged_over(tree)}. All runs of a channel share its scale."
     )
-    return _drawn([(lambda: plots.records(tree), caption)] if reading.channels(tree) else [])
+    return _each([(lambda: plots.records(tree), caption)] if reading.channels(tree) else [])
 
 
-def response_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
+def response_figures(tree: xr.DataTree) -> list[Drawn]:
     """What multisine runs show before any model; nothing without such runs."""
     group = reading.group(tree, schema.FREQUENCY_RESPONSE)
     if group is None:
@@ -194,7 +197,7 @@ def response_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
         ]
         draw = partial(plots.frequency_response, group, output)
         entries.append((draw, f"{lead} {' '.join(map(begin, said))}"))
-    return _drawn(entries)
+    return _each(entries)
 
 
 def averaged_over(tree: xr.DataTree, lead: str = ", averaged over the periods of each run") -> str:
@@ -205,38 +208,43 @@ def averaged_over(tree: xr.DataTree, lead: str = ", averaged over the periods of
     return lead if all(periodic) else f"{lead} that has periods"
 
 
-def fit_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
+def fit_figures(tree: xr.DataTree) -> list[Drawn]:
     """Measurement and prediction of each output."""
     entries: list[tuple[Draw, str]] = []
     for output in reading.outputs(tree):
         caption = f"Measured {output} and what the model predicts."
 
         entries.append((partial(plots.fit, tree, output), caption))
-    return _drawn(entries)
+    return _each(entries)
 
 
-def breakdown_figure(tree: xr.DataTree) -> list[CaptionedFigure]:
-    """The breakdown of the repeating residual; nothing without a periodic run that has one."""
+def breakdown_figure(tree: xr.DataTree) -> list[Drawn]:
+    """The breakdown of the repeating residual."""
+    return [partial(_breakdown, tree)]
+
+
+def _breakdown(tree: xr.DataTree) -> CaptionedFigure | None:
+    """Nothing without a periodic run that has one."""
     try:
         excess = residual_breakdown(tree)["excess"].values
     except (InputError, KeyError):
-        return []
+        return None
     if not any(map(has_excess, excess)):
-        return []
+        return None
     caption = (
         "How the repeating error divides over harmonics and coordinates, all runs together. Each "
         "bar is the share that one function of that coordinate, the same in all runs, explains; "
         "for run and group it is a constant for each. Constants point to conditions and sensors, "
         "a function of velocity to friction and damping, of position to stiffness and gas."
     )
-    return _drawn([(lambda: plots.residual_breakdown(tree), caption)])
+    return _captioned(lambda: plots.residual_breakdown(tree), caption)
 
 
-def residual_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
+def residual_figures(tree: xr.DataTree) -> list[Drawn]:
     """The residual of each output against phase, velocity and stroke."""
     if schema.RESIDUAL not in tree.children:
         return []
-    return _drawn(list(_residuals(tree)))
+    return _each(list(_residuals(tree)))
 
 
 def residual_title(tree: xr.DataTree) -> str:
@@ -274,7 +282,7 @@ def _residuals(tree: xr.DataTree) -> Iterator[tuple[Draw, str]]:
                 )
 
 
-def structures_figure(tree: xr.DataTree) -> list[CaptionedFigure]:
+def structures_figure(tree: xr.DataTree) -> list[Drawn]:
     """The probabilities of what is missing; nothing where they are not known."""
     if not reading.summary(tree).get("structures"):
         return []
@@ -284,10 +292,10 @@ def structures_figure(tree: xr.DataTree) -> list[CaptionedFigure]:
         "probable structures, a column each with its probability on top and a dot for each member; "
         "hollow dots: from scores, not estimated together."
     )
-    return _drawn([(lambda: plots.structures(tree), caption)])
+    return _each([(lambda: plots.structures(tree), caption)])
 
 
-def ranking_figure(tree: xr.DataTree, number: int) -> list[CaptionedFigure]:
+def ranking_figure(tree: xr.DataTree, number: int) -> list[Drawn]:
     """The candidates of one round."""
     caption = (
         f"Candidates of round {number + 1}: the share of the excess error that each would "
@@ -296,10 +304,10 @@ def ranking_figure(tree: xr.DataTree, number: int) -> list[CaptionedFigure]:
     entry = reading.summary(tree)["rounds"][number]
     if entry["accepted"]:
         caption += " These data cannot tell the effects marked ≈ from the accepted one."
-    return _drawn([(lambda: plots.ranking(tree, number), caption)] if entry["candidates"] else [])
+    return _each([(lambda: plots.ranking(tree, number), caption)] if entry["candidates"] else [])
 
 
-def proposal_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[CaptionedFigure]:
+def proposal_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Drawn]:
     """Where on the rig's range the rivals of one round would be told apart."""
     group = reading.group(tree, schema.PROPOSAL)
     if group is None or proposal_table(entry) is None:
@@ -312,15 +320,15 @@ def proposal_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Caption
     rivals = listed([called(one, titles) for one in names])
     if entry["question"] == "parameters":
         caption = "Information of a run on the parameters. Where it is blank the rig cannot go."
-        return _drawn([(lambda: plots.proposal(tree, rounds.index(entry["round"])), caption)])
+        return _each([(lambda: plots.proposal(tree, rounds.index(entry["round"])), caption)])
     caption = (
         "Standard deviations by which a run would separate the least separated pair of "
         f"{rivals}, at the mean position that is best for it. Where it is blank the rig cannot go."
     )
-    return _drawn([(lambda: plots.proposal(tree, rounds.index(entry["round"])), caption)])
+    return _each([(lambda: plots.proposal(tree, rounds.index(entry["round"])), caption)])
 
 
-def nonparametric_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[CaptionedFigure]:
+def nonparametric_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Drawn]:
     """The shape of an effect without a name, in the round that added it."""
     if schema.NONPARAMETRIC not in tree.children:
         return []
@@ -330,17 +338,17 @@ def nonparametric_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Ca
         "The effect that has no name: what it adds to the balance, beside all that the model's own "
         "terms do, with its 95 % band. Beyond the range shown nothing is known of it."
     )
-    return _drawn([(lambda: plots.nonparametric_shape(tree), caption)])
+    return _each([(lambda: plots.nonparametric_shape(tree), caption)])
 
 
-def error_figure(tree: xr.DataTree) -> list[CaptionedFigure]:
+def error_figure(tree: xr.DataTree) -> list[Drawn]:
     """The error of each run."""
     of, what = words(reading.summary(tree)), reading.averaged_word(tree).capitalize()
     caption = f"{what} error of each run over {of}, on a logarithmic axis. At 1 nothing is missing."
-    return _drawn([(lambda: plots.error(tree), caption)])
+    return _each([(lambda: plots.error(tree), caption)])
 
 
-def posterior_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
+def posterior_figures(tree: xr.DataTree) -> list[Drawn]:
     """Pairs, and the point against the posterior."""
     if schema.POSTERIOR not in tree.children:
         return []
@@ -355,10 +363,10 @@ def posterior_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
     entries: list[tuple[Draw, str]] = [(lambda: plots.corner(tree), pairs)]
     if schema.POINT in tree.children:
         entries.append((lambda: plots.point_against_posterior(tree), forest))
-    return _drawn(entries)
+    return _each(entries)
 
 
-def predictive_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
+def predictive_figures(tree: xr.DataTree) -> list[Drawn]:
     """The posterior prediction of each output."""
     if schema.PERIOD_PREDICTIVE not in tree.children:
         return []
@@ -372,15 +380,15 @@ def predictive_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
             )
 
             entries.append((partial(plots.predictive, tree, output), caption))
-    return _drawn(entries)
+    return _each(entries)
 
 
-def trace_figures(tree: xr.DataTree) -> list[CaptionedFigure]:
+def trace_figures(tree: xr.DataTree) -> list[Drawn]:
     """The chains."""
     if schema.POSTERIOR not in tree.children:
         return []
     caption = "Some walkers of each ensemble, one colour an ensemble: colours must not keep apart."
-    return _drawn([(lambda: plots.trace(tree), caption)])
+    return _each([(lambda: plots.trace(tree), caption)])
 
 
 #: Numbers of one curve of the viewer at least and at most, and of all curves together.
@@ -499,5 +507,10 @@ def _number(value: float) -> float | None:
     return float(f"{value:.5g}") if np.isfinite(value) else None
 
 
-def _drawn(entries: list[tuple[Draw, str]]) -> list[CaptionedFigure]:
-    return [CaptionedFigure(encode_figure(draw()), caption) for draw, caption in entries]
+def _each(entries: list[tuple[Draw, str]]) -> list[Drawn]:
+    """One call for each figure, so that several processes can share those of a kind."""
+    return [partial(_captioned, draw, caption) for draw, caption in entries]
+
+
+def _captioned(draw: Draw, caption: str) -> CaptionedFigure:
+    return CaptionedFigure(encode_figure(draw()), caption)

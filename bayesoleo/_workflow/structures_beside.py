@@ -12,7 +12,7 @@ from typing import Any, Self
 import xarray as xr
 
 from bayesoleo._parallel import single_blas_thread
-from bayesoleo._report.page_figures import WITHOUT_DRAWS, draw_ahead, shared_by
+from bayesoleo._report.page_figures import Part, draw_ahead, parts_ahead, shared_by
 from bayesoleo._types import ProgressCallback
 from bayesoleo._worker_processes import Beside, start_ahead
 from bayesoleo._workflow.output import PROPOSALS_STAGE, SEARCH_STAGE, reason_of
@@ -118,7 +118,7 @@ def begun_beside(
     """
     if asked.loop.without_structures is None:
         return None
-    then = None if shown is None else (draw_ahead, shared_by(shown), list(WITHOUT_DRAWS))
+    then = None if shown is None else (draw_ahead, shared_by(shown), parts_ahead(shown))
     return Beside.begun(answer, asked, jobs, then)
 
 
@@ -175,7 +175,6 @@ class Early[K]:
             self._beside.drop()
 
 
-def pictures_of(beside: Beside[Asked, Answer]) -> dict[str, list[Any]]:
-    """The figures that it has drawn, by kind."""
-    kinds = list(WITHOUT_DRAWS)
-    return {kinds[k]: drawn for k, drawn in beside.taken().items() if drawn is not None}
+def pictures_of(beside: Beside[Asked, Answer]) -> dict[Part, list[Any]]:
+    """The figures that it has drawn."""
+    return dict(drawn for drawn in beside.taken().values() if drawn is not None)

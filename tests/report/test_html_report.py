@@ -377,6 +377,28 @@ def test_shortened_paths_are_the_same_but_for_a_hundredth_of_a_point():
     assert sections._short(curve) == curve
 
 
+def test_one_figure_of_a_kind_that_fails_leaves_the_others(oleo, unpainted, monkeypatch, tmp_path):
+    rightly = sections.plots.residual
+
+    def failing(tree, output, against="phase"):
+        if against == "velocity":
+            raise ValueError("no velocity")
+        return rightly(tree, output, against)
+
+    assert write_report(oleo, tmp_path / "whole.html") == []
+    monkeypatch.setattr(sections.plots, "residual", failing)
+    said = write_report(oleo, tmp_path / "without.html")
+    assert len(said) == 1  # once for all outputs
+    assert "figure of the residual" in said[0]
+    assert "no velocity" in said[0]
+    whole, left = (
+        (tmp_path / f"{name}.html").read_text(encoding="utf-8").count("</b> Residual of ")
+        for name in ("whole", "without")
+    )
+    outputs = len(sections.reading.outputs(oleo))
+    assert left == whole - outputs > 0
+
+
 @pytest.mark.slow
 def test_figures_of_another_process_are_the_same(oleo, page, monkeypatch):
     monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
