@@ -358,8 +358,8 @@ def begin(command: str, given: Mapping[str, Any], *, search: bool) -> None:
     given : mapping of str to object
         Its arguments and options; ``quiet`` says nothing.
     search : bool
-        Whether another process will help: it loads them at the same time, unless something has to
-        be compiled first.
+        Whether another process will help: it reads a campaign of small files and loads them at the
+        same time, unless something has to be compiled first.
     """
     campaign = given.get("campaign")
     if isinstance(campaign, Path) and not campaign.expanduser().exists():
@@ -372,10 +372,13 @@ def begin(command: str, given: Mapping[str, Any], *, search: bool) -> None:
     from bayesoleo._first_compilation import begin_early
     from bayesoleo._kept_processes import EARLY, load
     from bayesoleo._worker_processes import start_ahead
+    from bayesoleo._workflow.read_early import begin_reading
 
     jobs = given.get("jobs")
     if not begin_early(jobs) and search:
-        start_ahead(jobs=jobs)
+        reads = isinstance(campaign, Path) and begin_reading(campaign, jobs)
+        if not reads:
+            start_ahead(jobs=jobs)
     load([EARLY, "bayesoleo._workflow.closing"])
 
 

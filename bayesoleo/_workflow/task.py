@@ -19,6 +19,7 @@ import xarray as xr
 
 from bayesoleo import _schema as schema
 from bayesoleo._units import angle_hint, parse_unit, same_quantity
+from bayesoleo._workflow.read_early import read_early
 from bayesoleo._workflow.settings import Settings
 from bayesoleo.data._campaign import CampaignData, load_campaign
 from bayesoleo.data._data_warnings import data_warnings, frequency_warnings
@@ -266,12 +267,14 @@ def reduce(
     """
     if isinstance(campaign, ReducedCampaign):
         return campaign
-    loaded = (
-        campaign
-        if isinstance(campaign, CampaignData)
-        else load_campaign(campaign, progress=bool(progress))
-    )
-    reduced = reduce_campaign(loaded, jobs=jobs, progress=progress)
+    reduced = read_early(campaign)
+    if reduced is None:
+        loaded = (
+            campaign
+            if isinstance(campaign, CampaignData)
+            else load_campaign(campaign, progress=bool(progress))
+        )
+        reduced = reduce_campaign(loaded, jobs=jobs, progress=progress)
     for sentence in frequency_warnings(reduced.records):
         warnings.warn(sentence, DataWarning, stacklevel=2)
     return reduced

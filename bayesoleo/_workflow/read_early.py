@@ -1,0 +1,100 @@
+"""A campaign that another process reads and reduces while this one loads its libraries.
+
+Both take seconds, and the libraries that read a campaign are a small part of those of a search.
+"""
+
+from __future__ import annotations
+
+import tomllib
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bayesoleo._kept_processes import load
+from bayesoleo._process_messages import Message, dumps, loads
+from bayesoleo._worker_processes import OF_A_SEARCH, Beside
+
+if TYPE_CHECKING:
+    from bayesoleo.data._reduction import ReducedCampaign
+
+#: Bytes of files up to which one process has read them before this one needs them. Beyond it all
+#: cores read, and show how far they are.
+LARGEST = 10_000_000
+
+_begun: dict[Path, Beside[Path, Message]] = {}
+
+
+def begin_reading(campaign: Path, jobs: int | None = None) -> bool:
+    """Begin, and have the process load what a search needs after that.
+
+    Parameters
+    ----------
+    campaign : Path
+        Its folder or its ``campaign.toml``.
+    jobs : int, optional
+        Processes, this one included.
+
+    Returns
+    -------
+    bool
+        Whether it reads: not where files are large or have to be fetched first, or no process may.
+    """
+    if not _is_small(campaign):
+        return False
+    beside = Beside.begun(_read, campaign, jobs, then=(_loaded, OF_A_SEARCH, [None]))
+    if beside is None:
+        return False
+    _begun[campaign] = beside
+    return True
+
+
+def read_early(campaign: object) -> ReducedCampaign | None:
+    """The campaign if it was begun, once; None where it has to be read here, as where reading it
+    failed: the error is then told as ever.
+
+    Warns
+    -----
+    DataWarning
+        What reading it warned of.
+    """
+    beside = _begun.pop(campaign, None) if isinstance(campaign, Path) else None
+    if beside is None:
+        return None
+    try:
+        reduced, said = loads(beside.result())
+    except Exception:
+        return None
+    for text, category in said:
+        warnings.warn(text, category, stacklevel=3)
+    return reduced  # type: ignore[no-any-return]
+
+
+def _is_small(campaign: Path) -> bool:
+    """What cannot be read is left to those who say why."""
+    toml = campaign if campaign.suffix == ".toml" else campaign / "campaign.toml"
+    try:
+        with toml.open("rb") as file:
+            declared = tomllib.load(file)
+        if "dataset" in declared:
+            return False
+        files = {str(run["file"]) for run in declared["runs"]}
+        return sum((toml.parent / file).stat().st_size for file in files) <= LARGEST
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def _read(campaign: Path) -> Message:
+    """The reduced campaign and what was warned of, as a message: to make objects of it loads
+    modules, for which two threads must not wait for each other.
+    """
+    from bayesoleo.data._campaign import load_campaign
+    from bayesoleo.data._reduction import reduce_campaign
+
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        reduced = reduce_campaign(load_campaign(campaign), jobs=1)
+    return dumps((reduced, [(str(one.message), one.category) for one in said]))
+
+
+def _loaded(modules: tuple[str, ...], _: Any) -> None:
+    load(modules)
