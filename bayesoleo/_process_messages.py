@@ -53,7 +53,8 @@ def as_it_is(message: Message) -> Message:
 def _extremes() -> tuple[Any, ...]:
     """SymPy's largest and smallest of several, if anything may hold one."""
     module = sys.modules.get("sympy")
-    return () if module is None else (module.Max, module.Min)
+    # Another thread may be loading it.
+    return tuple(getattr(module, name) for name in ("Max", "Min") if hasattr(module, name))
 
 
 def _as_it_was(kind: Any, arguments: tuple[Any, ...]) -> Any:

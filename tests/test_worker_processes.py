@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+import types
 from pathlib import Path
 
 import numpy as np
@@ -519,3 +520,9 @@ def test_what_takes_long_is_begun_first_and_here(eager):
     # The process that helps takes the short ones, from the last on.
     helped = [(begun, k) for k, (pid, begun) in enumerate(found) if pid != os.getpid()]
     assert min(helped)[1] == 24
+
+
+def test_a_message_is_made_while_another_thread_loads_sympy(monkeypatch):
+    """Until it is loaded it has no extremes, and nothing holds one."""
+    monkeypatch.setitem(sys.modules, "sympy", types.ModuleType("sympy"))
+    assert messages.loads(messages.dumps((1, "one"))) == (1, "one")

@@ -358,8 +358,8 @@ def begin(command: str, given: Mapping[str, Any], *, search: bool) -> None:
     given : mapping of str to object
         Its arguments and options; ``quiet`` says nothing.
     search : bool
-        Whether another process will help: it reads a campaign of small files and loads them at the
-        same time, unless something has to be compiled first.
+        Whether another process will help. It reads a campaign whose files are small, then loads
+        the libraries too; not where something has to be compiled first.
     """
     campaign = given.get("campaign")
     if isinstance(campaign, Path) and not campaign.expanduser().exists():

@@ -42,7 +42,8 @@ def figures_of(
     items = [(*makers[kind], number) for kind, number in left]
     first = before if ahead is None else lambda: None
     found = process_map(_draw, shared_by(tree), items, before=first)
-    drawing.failed += dict.fromkeys(text for _, failed in found for text in failed)
+    said = [*drawing.failed, *(text for _, failed in found for text in failed)]
+    drawing.failed = list(dict.fromkeys(said))  # what fails of several figures, once
     known |= {part: drawn for part, (drawn, _) in zip(left, found, strict=True)}
     return {
         kind: [one for part in every if part[0] == kind for one in known[part]] for kind in makers

@@ -157,19 +157,19 @@ class Drawing:
             return draw()
         except Exception as error:
             reason = " ".join(f"{type(error).__name__}: {error}".split())
-            said = f"The figure of {what} could not be drawn. {reason}"
+            said = f"A figure of {what} could not be drawn. {reason}"
             self.failed += [said] if said not in self.failed else []
             return []
 
 
 Draw = Callable[[], Figure]
-#: Draws one figure of a kind; None where there is nothing to show.
-Drawn = Callable[[], CaptionedFigure | None]
+#: Draws one figure of a kind; gives None where there is nothing to show.
+Drawer = Callable[[], CaptionedFigure | None]
 
 LOOPS: tuple[Against, ...] = ("velocity", "stroke")
 
 
-def data_figures(tree: xr.DataTree) -> list[Drawn]:
+def data_figures(tree: xr.DataTree) -> list[Drawer]:
     """The records."""
     caption = (
         f"The records as measured{averaged_over(tree)}. All runs of a channel share its scale."
@@ -177,7 +177,7 @@ def data_figures(tree: xr.DataTree) -> list[Drawn]:
     return _each([(lambda: plots.records(tree), caption)] if reading.channels(tree) else [])
 
 
-def response_figures(tree: xr.DataTree) -> list[Drawn]:
+def response_figures(tree: xr.DataTree) -> list[Drawer]:
     """What multisine runs show before any model; nothing without such runs."""
     group = reading.group(tree, schema.FREQUENCY_RESPONSE)
     if group is None:
@@ -208,7 +208,7 @@ def averaged_over(tree: xr.DataTree, lead: str = ", averaged over the periods of
     return lead if all(periodic) else f"{lead} that has periods"
 
 
-def fit_figures(tree: xr.DataTree) -> list[Drawn]:
+def fit_figures(tree: xr.DataTree) -> list[Drawer]:
     """Measurement and prediction of each output."""
     entries: list[tuple[Draw, str]] = []
     for output in reading.outputs(tree):
@@ -218,7 +218,7 @@ def fit_figures(tree: xr.DataTree) -> list[Drawn]:
     return _each(entries)
 
 
-def breakdown_figure(tree: xr.DataTree) -> list[Drawn]:
+def breakdown_figure(tree: xr.DataTree) -> list[Drawer]:
     """The breakdown of the repeating residual."""
     return [partial(_breakdown, tree)]
 
@@ -240,7 +240,7 @@ def _breakdown(tree: xr.DataTree) -> CaptionedFigure | None:
     return _captioned(lambda: plots.residual_breakdown(tree), caption)
 
 
-def residual_figures(tree: xr.DataTree) -> list[Drawn]:
+def residual_figures(tree: xr.DataTree) -> list[Drawer]:
     """The residual of each output against phase, velocity and stroke."""
     if schema.RESIDUAL not in tree.children:
         return []
@@ -282,7 +282,7 @@ def _residuals(tree: xr.DataTree) -> Iterator[tuple[Draw, str]]:
                 )
 
 
-def structures_figure(tree: xr.DataTree) -> list[Drawn]:
+def structures_figure(tree: xr.DataTree) -> list[Drawer]:
     """The probabilities of what is missing; nothing where they are not known."""
     if not reading.summary(tree).get("structures"):
         return []
@@ -295,7 +295,7 @@ def structures_figure(tree: xr.DataTree) -> list[Drawn]:
     return _each([(lambda: plots.structures(tree), caption)])
 
 
-def ranking_figure(tree: xr.DataTree, number: int) -> list[Drawn]:
+def ranking_figure(tree: xr.DataTree, number: int) -> list[Drawer]:
     """The candidates of one round."""
     caption = (
         f"Candidates of round {number + 1}: the share of the excess error that each would "
@@ -307,7 +307,7 @@ def ranking_figure(tree: xr.DataTree, number: int) -> list[Drawn]:
     return _each([(lambda: plots.ranking(tree, number), caption)] if entry["candidates"] else [])
 
 
-def proposal_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Drawn]:
+def proposal_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Drawer]:
     """Where on the rig's range the rivals of one round would be told apart."""
     group = reading.group(tree, schema.PROPOSAL)
     if group is None or proposal_table(entry) is None:
@@ -328,7 +328,7 @@ def proposal_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Drawn]:
     return _each([(lambda: plots.proposal(tree, rounds.index(entry["round"])), caption)])
 
 
-def nonparametric_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Drawn]:
+def nonparametric_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Drawer]:
     """The shape of an effect without a name, in the round that added it."""
     if schema.NONPARAMETRIC not in tree.children:
         return []
@@ -341,14 +341,14 @@ def nonparametric_figure(tree: xr.DataTree, entry: Mapping[str, Any]) -> list[Dr
     return _each([(lambda: plots.nonparametric_shape(tree), caption)])
 
 
-def error_figure(tree: xr.DataTree) -> list[Drawn]:
+def error_figure(tree: xr.DataTree) -> list[Drawer]:
     """The error of each run."""
     of, what = words(reading.summary(tree)), reading.averaged_word(tree).capitalize()
     caption = f"{what} error of each run over {of}, on a logarithmic axis. At 1 nothing is missing."
     return _each([(lambda: plots.error(tree), caption)])
 
 
-def posterior_figures(tree: xr.DataTree) -> list[Drawn]:
+def posterior_figures(tree: xr.DataTree) -> list[Drawer]:
     """Pairs, and the point against the posterior."""
     if schema.POSTERIOR not in tree.children:
         return []
@@ -366,7 +366,7 @@ def posterior_figures(tree: xr.DataTree) -> list[Drawn]:
     return _each(entries)
 
 
-def predictive_figures(tree: xr.DataTree) -> list[Drawn]:
+def predictive_figures(tree: xr.DataTree) -> list[Drawer]:
     """The posterior prediction of each output."""
     if schema.PERIOD_PREDICTIVE not in tree.children:
         return []
@@ -383,7 +383,7 @@ def predictive_figures(tree: xr.DataTree) -> list[Drawn]:
     return _each(entries)
 
 
-def trace_figures(tree: xr.DataTree) -> list[Drawn]:
+def trace_figures(tree: xr.DataTree) -> list[Drawer]:
     """The chains."""
     if schema.POSTERIOR not in tree.children:
         return []
@@ -507,7 +507,7 @@ def _number(value: float) -> float | None:
     return float(f"{value:.5g}") if np.isfinite(value) else None
 
 
-def _each(entries: list[tuple[Draw, str]]) -> list[Drawn]:
+def _each(entries: list[tuple[Draw, str]]) -> list[Drawer]:
     """One call for each figure, so that several processes can share those of a kind."""
     return [partial(_captioned, draw, caption) for draw, caption in entries]
 

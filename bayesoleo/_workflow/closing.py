@@ -106,7 +106,7 @@ def close(
 
     What is known is kept as soon as it is known, the estimate and each round: the same call, with
     the same campaign, model and settings, goes on after the last finished round. While the search
-    goes on, its result so far is written as well, three times a minute at most.
+    goes on, its result so far is written as well, once a minute at most.
 
     Parameters
     ----------

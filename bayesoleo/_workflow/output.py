@@ -65,7 +65,7 @@ FILES = (RESULTS, REPORT, SUMMARY)
 SWEPT = (*FILES, "each.nc", "replications.nc", "campaign")
 CHECKPOINTS, SEARCH, OLDER = "checkpoints", "search.pickle", "older"
 #: Seconds between results of a search that goes on. One takes two or three to write, a twentieth of
-#: that time, and the search goes on from what is kept besides.
+#: the time at most, and the search goes on from what is kept besides.
 OFTEN = 60.0
 #: By this file a folder of an older result is known as one that was made here, and may go.
 PUT_ASIDE = ".put-aside"
@@ -335,7 +335,7 @@ def write_result(
     groups : mapping of str to Dataset, optional
         What :func:`result_groups` has made of it, if that was done before.
     ahead : callable, optional
-        Gives the figures that have been drawn before, by kind.
+        Gives the figures that have been drawn before, by kind and number.
     """
     tree, summary = result_tree(task, loop, drawn, output, stages, questions, groups)
     if output.folder is None:

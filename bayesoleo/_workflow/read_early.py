@@ -1,6 +1,7 @@
 """A campaign that another process reads and reduces while this one loads its libraries.
 
 Both take seconds, and the libraries that read a campaign are a small part of those of a search.
+Beyond three jobs nothing is read early: all of them read at once then.
 """
 
 from __future__ import annotations
@@ -11,14 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bayesoleo._kept_processes import load
-from bayesoleo._process_messages import Message, dumps, loads
+from bayesoleo._process_messages import Message, as_it_is, dumps, loads
 from bayesoleo._worker_processes import OF_A_SEARCH, Beside
 
 if TYPE_CHECKING:
     from bayesoleo.data._reduction import ReducedCampaign
 
-#: Bytes of files up to which one process has read them before this one needs them. Beyond it all
-#: cores read, and show how far they are.
+#: Bytes of files that one process reads in about the time that libraries take. Beyond it all cores
+#: read, and show how far they are.
 LARGEST = 10_000_000
 
 _begun: dict[Path, Beside[Path, Message]] = {}
@@ -39,6 +40,7 @@ def begin_reading(campaign: Path, jobs: int | None = None) -> bool:
     bool
         Whether it reads: not where files are large or have to be fetched first, or no process may.
     """
+    _begun.clear()  # of a command that failed before it asked
     if not _is_small(campaign):
         return False
     beside = Beside.begun(_read, campaign, jobs, then=(_loaded, OF_A_SEARCH, [None]))
@@ -49,8 +51,10 @@ def begin_reading(campaign: Path, jobs: int | None = None) -> bool:
 
 
 def read_early(campaign: object) -> ReducedCampaign | None:
-    """The campaign if it was begun, once; None where it has to be read here, as where reading it
-    failed: the error is then told as ever.
+    """The campaign, if :func:`begin_reading` began it; only the first call gets it.
+
+    None if it has to be read here. If reading failed there, it is read again here, and the error is
+    raised here.
 
     Warns
     -----
@@ -61,7 +65,8 @@ def read_early(campaign: object) -> ReducedCampaign | None:
     if beside is None:
         return None
     try:
-        reduced, said = loads(beside.result())
+        # What comes out of a message may not be written to: code would be compiled for that.
+        reduced, said = loads(as_it_is(beside.result()))
     except Exception:
         return None
     for text, category in said:

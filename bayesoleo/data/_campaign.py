@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesoleo._parallel import single_blas_thread
 from bayesoleo._types import Array, Float
 from bayesoleo._units import parse_unit
 from bayesoleo.data._campaign_toml import (
@@ -94,6 +95,7 @@ class CampaignData:
         )
 
 
+@single_blas_thread()  # more threads add in another order, and the checksum of times would differ
 def load_campaign(path: str | os.PathLike[str], *, progress: bool = False) -> CampaignData:
     """Load a campaign and check it.
 

@@ -169,8 +169,9 @@ class RunPredictor:
 
         # Copies may be written to: kernels would compile once more for arrays that may not.
         key = "plan", self.scheme_name, self.steps
-        index, position, *weights = _plans.of(self.record, key, made).copy()
-        return SamplePlan(index.astype(np.int64), position, *np.split(np.array(weights), 3))
+        kept = _plans.of(self.record, key, made)
+        weights = np.split(kept[2:].copy(), 3)
+        return SamplePlan(kept[0].astype(np.int64), kept[1].copy(), *weights)
 
     def _observe(self, position: Array) -> None:
         """What is measured, the inputs at the samples, and no solution yet."""

@@ -8,9 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_campaigns import damper_campaign
+from small_campaigns import DAMPER_RUNS, damper_campaign
+from threadpoolctl import threadpool_limits
+from typer.testing import CliRunner
 
 import bayesoleo._kept_processes as kept_processes
+from bayesoleo._cli import app
 from bayesoleo._workflow import read_early as early
 from bayesoleo._workflow.task import reduce
 from bayesoleo.errors import CampaignError, DataWarning
@@ -21,7 +24,8 @@ def campaign(tmp_path, monkeypatch) -> Path:
     """A campaign that may be read elsewhere; no process is left."""
     monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
     monkeypatch.setattr(early, "OF_A_SEARCH", ())
-    damper_campaign(tmp_path / "rig", force=lambda x, v, _: 900.0 * x + 40.0 * v, seed=1)
+    # Arrays of more than 64 KiB are sent in another way, and BLAS adds them in its threads.
+    damper_campaign(tmp_path / "rig", runs=DAMPER_RUNS[:2], periods=150, seed=1)
     yield tmp_path / "rig"
     early._begun.clear()
     kept_processes.end_processes()
@@ -34,7 +38,8 @@ def elsewhere(monkeypatch):
     def never(*_, **__):
         raise AssertionError("read here")
 
-    monkeypatch.setattr("bayesoleo._workflow.task.load_campaign", never)
+    for module in ("_workflow.task", "data._campaign"):
+        monkeypatch.setattr(f"bayesoleo.{module}.load_campaign", never)
 
 
 def assert_same(one, other):
@@ -63,13 +68,28 @@ def test_it_is_the_same_as_read_here(campaign, elsewhere, monkeypatch):
     assert early.begin_reading(campaign, jobs=2)
     found = reduce(campaign)
     monkeypatch.undo()
-    assert_same(reduce(campaign), found)
+    with threadpool_limits(2, user_api="blas"):  # the other process has one
+        here = reduce(campaign)
+    assert here.records[0].time.nbytes > 2**16
+    assert_same(here, found)
 
 
-def test_it_is_read_again_for_the_next_call(campaign):
+def test_the_next_call_reads_it_again(campaign):
     assert early.begin_reading(campaign, jobs=2)
     first = reduce(campaign)
-    assert reduce(campaign) is not first
+    toml = campaign / "campaign.toml"
+    text = toml.read_text(encoding="utf-8")
+    toml.write_text(text.replace('name = "damper"', 'name = "another"'), encoding="utf-8")
+    assert (first.campaign.name, reduce(campaign).campaign.name) == ("damper", "another")
+
+
+def test_a_command_has_it_read_elsewhere(campaign, elsewhere, monkeypatch):
+    """What it began is what it takes: it then finds that the model has other channels."""
+    monkeypatch.setattr("bayesoleo._first_compilation.is_marked", lambda: True)
+    line = ["close", str(campaign), "--model", "f16n2d2", "--jobs", "2"]
+    ended = CliRunner().invoke(app, line)
+    assert "needs channel 'pressure'" in f"{ended.output} {ended.exception}"
+    assert not early._begun
 
 
 def test_what_it_warns_of_is_told_here(campaign):
