@@ -64,6 +64,8 @@ def read_early(campaign: object) -> ReducedCampaign | None:
     beside = _begun.pop(campaign, None) if isinstance(campaign, Path) else None
     if beside is None:
         return None
+    reduced: ReducedCampaign
+    said: list[tuple[str, type[Warning]]]
     try:
         # What comes out of a message may not be written to: code would be compiled for that.
         reduced, said = loads(as_it_is(beside.result()))
@@ -71,11 +73,12 @@ def read_early(campaign: object) -> ReducedCampaign | None:
         return None
     for text, category in said:
         warnings.warn(text, category, stacklevel=3)
-    return reduced  # type: ignore[no-any-return]
+    return reduced
 
 
 def _is_small(campaign: Path) -> bool:
-    """What cannot be read is left to those who say why."""
+    """By the declaration alone: the modules that check it take seconds to load, and say what is
+    wrong with it."""
     toml = campaign if campaign.suffix == ".toml" else campaign / "campaign.toml"
     try:
         with toml.open("rb") as file:
@@ -89,8 +92,10 @@ def _is_small(campaign: Path) -> bool:
 
 
 def _read(campaign: Path) -> Message:
-    """The reduced campaign and what was warned of, as a message: to make objects of it loads
-    modules, for which two threads must not wait for each other.
+    """The reduced campaign and its warnings as a message.
+
+    The thread that waits for them must not make objects of them: that loads modules, and while the
+    command loads others the two threads could wait for each other.
     """
     from bayesoleo.data._campaign import load_campaign
     from bayesoleo.data._reduction import reduce_campaign
