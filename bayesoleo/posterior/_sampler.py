@@ -30,6 +30,7 @@ from bayesoleo.posterior._log_density import Density, LogDensity
 from bayesoleo.posterior._mixture import Mixture
 from bayesoleo.posterior._mode_search import with_other_modes
 from bayesoleo.posterior._stopping import (
+    ENOUGH_QUICK,
     ProgressBar,
     Quality,
     Schedule,
@@ -181,7 +182,7 @@ def sample(
     if quick:
         most = max(_quick_evaluations(log_density), QUICK_STEPS * group.chains)
         max_evaluations = min(max_evaluations, most)
-    schedule = _schedule(effective_size, max_evaluations, segment, quick)
+    schedule = _schedule(effective_size, max_evaluations, segment, quick, group.chains)
     print_of_run = _fingerprint(fingerprint, group, start, seed, schedule, number)
     with open_store(place, print_of_run) as store, connected(scheduler) as client:
         if client is not None:
@@ -281,10 +282,15 @@ def _quick_evaluations(log_density: Density) -> int:
     return min(QUICK_EVALUATIONS, QUICK_TIME_STEPS // max(steps, 1))
 
 
-def _schedule(effective_size: float, evaluations: int, segment: int, quick: bool) -> Schedule:
+def _schedule(
+    effective_size: float, evaluations: int, segment: int, quick: bool, walkers: int | None = None
+) -> Schedule:
+    """Schedule of ensembles with so many walkers in all, or of the no-U-turn sampler."""
     if quick:
-        return Schedule(min(effective_size, 200.0), evaluations, 20, 3, 1, 16, 5.0, segment)
-    return Schedule(effective_size, evaluations, 20, 6, 2, 50, 20.0, segment)
+        # Many walkers keep enough draws in a few moves; each evaluation may take a millisecond.
+        least = 16 if walkers is None else max(8, -(-ENOUGH_QUICK // walkers))
+        return Schedule(min(effective_size, 200.0), evaluations, 5, 5, 1, 5.0, least, 5.0, segment)
+    return Schedule(effective_size, evaluations, 20, 6, 2, 10.0, 50, 20.0, segment)
 
 
 def _fingerprint(
@@ -345,7 +351,7 @@ def _searched(
 def _warm_up(
     store: Store, group: Ensembles, schedule: Schedule, bar: ProgressBar, tuned: bool
 ) -> None:
-    """Rounds of doubling length, the mixture adapted after each, until one lasts ten times tau.
+    """Rounds of doubling length, the mixture adapted after each, until one lasts long enough.
 
     Where rounds are few, the weights of the moves are tuned too, after one whose mixture missed:
     its proposals would be most of what is evaluated.
@@ -375,7 +381,7 @@ def _is_warm(segments: list[Segment], schedule: Schedule) -> bool:
     if len(rounds) < 2:
         return False
     times = autocorrelation_time(rounds[-1].coords.swapaxes(0, 1))
-    return bool(np.all(rounds[-1].draws >= 10 * times))
+    return bool(np.all(rounds[-1].draws >= schedule.warm_times * times))
 
 
 def _tuned(segments: list[Segment]) -> MoveWeights:

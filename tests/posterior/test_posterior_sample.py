@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from posterior_gas_spring import gas_spring, quadrature
 from posterior_targets import Banana, BentRidge, Gaussian
+from scipy.stats import norm
 
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._campaign_problem import CampaignProblem
@@ -17,7 +18,7 @@ from bayesoleo.posterior._diagnostics import effective_size
 from bayesoleo.posterior._ensemble_moves import Ensembles, MoveWeights
 
 
-def normal_mixture(sd, *, off: float = 0.0, stretch: float = 1.0) -> Mixture:
+def normal_mixture(sd, *, off: float | np.ndarray = 0.0, stretch: float = 1.0) -> Mixture:
     sd = np.asarray(sd, dtype=float)
     return Mixture((off * sd)[None], np.diag((stretch * sd) ** 2)[None], np.zeros(1))
 
@@ -81,6 +82,27 @@ def test_a_gaussian_from_a_start_that_is_off(dimension):
     within_error(samples, np.zeros(dimension), sd)
 
 
+@pytest.mark.statistical
+@pytest.mark.parametrize("far", [0.3, 1.0])
+def test_quantiles_of_quick_runs_err_by_what_their_effective_size_says(far):
+    """Of 40 runs of six coordinates, from a start that is off by some standard deviations."""
+    sd, levels, errors = np.ones(6), np.array([0.05, 0.5, 0.95]), []
+    for seed in range(40):
+        off = far * np.random.default_rng(seed).standard_normal(6)
+        found = sample(
+            Gaussian(sd), normal_mixture(sd, off=off), seed=seed, quick=True, progress=False,
+            climbs=0,
+        )  # fmt: skip
+        quantiles = np.quantile(found.draws.reshape(-1, 6), levels, axis=0)
+        sizes = found.effective_size
+        errors.append((norm.cdf(quantiles.T) - levels) * np.sqrt(sizes)[:, None])
+    scaled = np.array(errors) / np.sqrt(levels * (1 - levels))
+    # 240 errors of each level, those of one run nearly independent: their root mean square is known
+    # to 5 %. Sizes are the smallest of some estimates, so that it is 0.95 on average.
+    assert np.sqrt(np.mean(scaled**2, axis=(0, 1))) == pytest.approx(0.95, abs=0.2)
+    assert abs(scaled.mean(axis=(0, 1))).max() < 4 / np.sqrt(240)
+
+
 @pytest.mark.slow
 def test_a_curved_density_that_no_mixture_fits():
     target = Banana(np.ones(4))
@@ -117,7 +139,8 @@ def test_a_first_look_warms_up_once_where_the_mixture_is_the_posterior(monkeypat
         assert samples.reached
         within_error(samples, np.zeros(3), sd)
         rounds[name] = phases.count("warm-up")
-    assert rounds == {"near": 1, "far": 2, "full": 2}
+    # Rounds of a quick run have 5, 10 and 20 draws, those of a full one 20 and 40.
+    assert rounds == {"near": 1, "far": 3, "full": 2}
 
 
 def test_proposals_of_a_mixture_that_misses_are_fewer_already_in_the_warm_up(monkeypatch):
@@ -131,9 +154,8 @@ def test_proposals_of_a_mixture_that_misses_are_fewer_already_in_the_warm_up(mon
     sd = np.ones(6)
     mixture = normal_mixture(sd, stretch=30.0)
     found = sample(Gaussian(sd), mixture, seed=1, quick=True, progress=False, climbs=0)
-    first, second = shares[:2]
-    assert first == 0.8
-    assert second == 0.3
+    # In rounds of 5 and 10 draws walkers still come in from afar, by proposals that are accepted.
+    assert shares[:4] == [0.8, 0.8, 0.8, 0.3]
     # With 80 % of them it took 38 320, of which 9 in 100 were accepted in the end.
     assert found.reached
     assert found.evaluations < 25_000
@@ -153,7 +175,7 @@ def test_a_quick_run_hands_on_draws_that_tell_something_new():
     chains, draws, _ = few.draws.shape
     assert chains * draws >= 1000
     tau = few.autocorrelation_time
-    assert tau.min() > 10
+    assert tau.min() > 8
     kept = few.evaluations // chains
     assert draws < kept / (tau.min() - 1)
     assert len(few.failed) == len(few.log_density[0]) == draws
@@ -179,7 +201,7 @@ def test_a_quick_run_hands_on_enough_of_draws_that_are_nearly_independent():
     few = sample(Gaussian(sd), normal_mixture(sd), seed=1, quick=True, progress=False, climbs=0)
     chains, draws, _ = few.draws.shape
     assert few.autocorrelation_time.max() < 3
-    assert 1000 <= chains * draws < 2000 <= few.evaluations
+    assert 1000 <= chains * draws < few.evaluations < 2000
     own = effective_size(few.draws)
     # Scatter of an estimate from chains of about ten draws.
     assert own.min() > 0.6 * few.effective_size.min()
