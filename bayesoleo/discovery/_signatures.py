@@ -164,30 +164,40 @@ def colour_of(lines: Sequence[Lines]) -> tuple[tuple[float, float], float]:
     Whittle (1953), Arkiv för Matematik 2, 423-434.
     """
     step = float(np.median([one.step for one in lines]))
+    cosines = [np.cos(one.angle) for one in lines]
 
-    def cost(x: Array) -> float:
-        share, total = MOST_SHARE * float(expit(x[0])), 0.0
-        for one in lines:
-            density = spectrum_of_process(one.angle, share, one.step / (step * float(np.exp(x[1]))))
-            level = np.mean(one.power / density)  # each run's own variance
-            total += float(np.sum(np.log(density * level) + one.power / (density * level)))
-        return total
+    def cost(x: Array) -> tuple[float, Array]:
+        """Of log odds of the share over its limit, and the log time in steps; with its gradient."""
+        part, total, slope = float(expit(x[0])), 0.0, np.zeros(2)
+        for one, cosine in zip(lines, cosines, strict=True):
+            steps = one.step / (step * float(np.exp(x[1])))
+            density, by_share, by_steps = spectrum_of_process(cosine, MOST_SHARE * part, steps)
+            ratio = one.power / density  # each run's own variance is its mean
+            total += float(np.sum(np.log(density)) + ratio.size * (np.log(ratio.mean()) + 1))
+            weight = (1 - ratio / ratio.mean()) / density
+            slope += weight @ by_share * MOST_SHARE * part * (1 - part), weight @ by_steps * -steps
+        return total, slope
 
-    white = cost(np.array([-40.0, 0.0]))
+    white, _ = cost(np.array([-40.0, 0.0]))
     starts = [np.array([s, np.log(t)]) for s in (-1.0, 3.0) for t in (1.0, 10.0, 60.0)]
     bounds = [(-8.0, 12.0), (np.log(0.2), np.log(1e4))]
-    found = [optimize.minimize(cost, x, method="L-BFGS-B", bounds=bounds) for x in starts]
+    found = [
+        optimize.minimize(cost, x, jac=True, method="L-BFGS-B", bounds=bounds) for x in starts
+    ]
     best = min(found, key=lambda one: float(one.fun))
     p_value = float(stats.chi2.sf(2 * max(white - float(best.fun), 0.0), 2))
     share = MOST_SHARE * float(expit(best.x[0]))
     return (share, step * float(np.exp(best.x[1]))), p_value
 
 
-def spectrum_of_process(angle: Array, share: float, steps: float) -> Array:
-    """Spectrum of unit-variance noise of which a share decays by ``exp(-steps)`` per sample."""
+def spectrum_of_process(cosine: Array, share: float, steps: float) -> tuple[Array, Array, Array]:
+    """Spectrum of unit-variance noise of which a share decays by ``exp(-steps)`` per sample, and
+    its derivatives by share and steps, at angles per sample with such cosines."""
     a = np.exp(-steps)
-    process = -np.expm1(-2 * steps) / (1 - 2 * a * np.cos(angle) + a * a)
-    return np.asarray((1 - share) + share * process)
+    below, above = 1 - 2 * a * cosine + a * a, -np.expm1(-2 * steps)
+    process = above / below
+    by_steps = share * 2 * a * (a - process * (cosine - a)) / below
+    return np.asarray((1 - share) + share * process), process - 1, by_steps
 
 
 def more_than_noise_p(fit: ModelFit, noise: Noise) -> float:

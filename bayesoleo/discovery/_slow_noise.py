@@ -90,7 +90,8 @@ def _time_of(lines: Sequence[Lines]) -> float | None:
         return None
     whitened = []
     for one in lines:
-        level = one.power / spectrum_of_process(one.angle, share, one.step / time)
+        density, _, _ = spectrum_of_process(np.cos(one.angle), share, one.step / time)
+        level = one.power / density
         whitened.append(level / level.mean())
     return time if _least_p(whitened) > UNLIKE else None
 

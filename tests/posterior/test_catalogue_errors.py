@@ -9,7 +9,7 @@ from scipy.special import logsumexp
 from test_error_model_densities import Campaign
 
 from bayesoleo.discovery._inference import error_model_by
-from bayesoleo.discovery._signatures import Lines, colour_of
+from bayesoleo.discovery._signatures import Lines, colour_of, spectrum_of_process
 from bayesoleo.error_models import CatalogueErrors, Frame, Signatures, error_model
 from bayesoleo.error_models._base import RunSamples
 from bayesoleo.error_models._catalogue_discrepancy import ALONE, REMAINDERS
@@ -234,6 +234,22 @@ def test_colour_is_measured_and_white_noise_seldom_coloured():
     chances = [colour_of([lines(rng, 0.0, 200)])[1] for _ in range(60)]
     # The probability is conservative: at most one of sixty below one in a hundred and twenty.
     assert np.sum(np.array(chances) < 1 / 120) <= 1
+
+
+@pytest.mark.parametrize(("share", "steps"), [(0.05, 3.0), (0.6, 0.1), (0.99, 0.03)])
+def test_the_spectrum_of_coloured_noise_has_unit_variance_and_these_derivatives(share, steps):
+    size = 10_000  # lines as close as they are to resolve a process of 33 steps
+    cosine = np.cos(np.pi * (np.arange(size) + 0.5) / size)
+    density, by_share, by_steps = spectrum_of_process(cosine, share, steps)
+    assert density.mean() == pytest.approx(1.0, abs=1e-6)
+    for found, change in ((by_share, (1e-5, 0.0)), (by_steps, (0.0, 1e-4 * steps))):
+        up, down = (
+            spectrum_of_process(cosine, share + sign * change[0], steps + sign * change[1])[0]
+            for sign in (1, -1)
+        )
+        # Differences over a ten-thousandth of the steps err by its square; the rest is round-off.
+        difference = (up - down) / (2 * sum(change))
+        assert found == pytest.approx(difference, rel=1e-6, abs=1e-6 * np.abs(found).max())
 
 
 def test_the_choice_says_why():
