@@ -58,8 +58,18 @@ def test_the_result_holds_what_was_assumed(tree):
     assert (np.abs(found["shift"]) < 0.5).all()
 
 
+# One of the 24 blocks is influential: its Pareto shape is .5 to 1.1 by the seed, in quick runs and
+# in long ones, on both sides of what ArviZ warns about. Six seeds give the density within 0.5.
+@pytest.mark.filterwarnings("ignore:Estimated shape parameter of Pareto:UserWarning")
+def test_densities_of_blocks_can_be_left_out_one_by_one(tree):
+    left_out = az.loo(tree)
+    assert left_out.n_data_points == 24
+    assert abs(left_out.elpd + 3307) < 2
+    # Three parameters, a variance and two quantities of the discrepancy are found from the blocks.
+    assert 1 < left_out.p < 12
+
+
 def test_figures_and_tables_come_from_the_result(tree, tmp_path):
-    assert az.loo(tree).n_data_points == 24
     sensitivity = prior_sensitivity(tree)
     assert float(sensitivity["prior"].sel(quantity="damping")) < 0.05
     for k, figure in enumerate(
