@@ -257,13 +257,13 @@ def state_of(assembly: Assembly, fit: ModelFit, roles: Roles) -> State:
         else predict_held_out(fit, roles.held_out)
     )
     jobs, policy = fit.numerics.jobs, fit.policy
-    found = _compared(fitted, "fit", roles, fit.numerics)
-    fit_errors, known = expected_of_fitted(fit, fitted, found)
+    found = _compared(fitted, held_out, roles, fit.numerics)
+    fit_errors, known = expected_of_fitted(fit, fitted, found[: len(fitted)])
     if roles.strategy != "leave-one-run-out":
         known = {"": known[""]} if known else {}
     rows = thread_map(
         lambda pair: expected_of_held_out(*pair, known, policy=policy),
-        list(zip(held_out, _compared(held_out, "hold-out", roles, fit.numerics), strict=True)),
+        list(zip(held_out, found[len(fitted) :], strict=True)),
         jobs,
     )
     return State(
@@ -278,15 +278,18 @@ def state_of(assembly: Assembly, fit: ModelFit, roles: Roles) -> State:
 
 
 def _compared(
-    predictions: Sequence[Prediction], role: str, roles: Roles, numerics: Numerics
+    fitted: Sequence[Prediction], held_out: Sequence[Prediction], roles: Roles, numerics: Numerics
 ) -> list[Compared]:
-    """Errors by run, with the noise as it was measured first."""
-    by_label = {p.record.label: role for p in predictions}
-    return thread_map(
-        lambda p: compared(p, by_label, roles.noise_of, policy=numerics.policy),
-        predictions,
-        numerics.jobs,
-    )
+    """Errors of fitted runs, then of those held out, with the noise as it was measured first."""
+    fit_or_not = [(p, "fit") for p in fitted] + [(p, "hold-out") for p in held_out]
+
+    def errors(item: tuple[Prediction, str]) -> Compared:
+        prediction, role = item
+        by_label = {prediction.record.label: role}
+        return compared(prediction, by_label, roles.noise_of, policy=numerics.policy)
+
+    # All at once, since there may be no more than one of each.
+    return thread_map(errors, fit_or_not, numerics.jobs)
 
 
 def _left_out(fit: ModelFit, roles: Roles) -> list[Prediction]:
