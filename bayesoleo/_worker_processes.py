@@ -469,6 +469,11 @@ class Beside[S, R]:
             kill_processes()
             self._thread.join()
 
+    @property
+    def answered(self) -> bool:
+        """Whether nobody waits any more: the call is done, or the process was lost."""
+        return self._answered.is_set()
+
     def result(self) -> R:
         """What came of it, or the exception that it raised, when it is done."""
         self._answered.wait()

@@ -1,6 +1,7 @@
 """All figures and formulas of the page by kind, drawn in several processes, some of them ahead.
 
-What shows the data and the search alone can be drawn while the posterior is sampled.
+What shows the data and the search alone can be drawn while the posterior is sampled, and what shows
+the draws while structures are compared.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from bayesoleo._worker_processes import process_map
 Maker = Callable[[xr.DataTree], list[Callable[[], Any]]]
 #: A kind of figure, and a number among those of this kind.
 Part = tuple[str, int]
+#: What has been drawn: of a part without a figure an empty list.
+Pictures = Mapping[Part, list[Any]]
 
 
 def figures_of(
@@ -29,7 +32,7 @@ def figures_of(
     summary: dict[str, Any],
     drawing: sections.Drawing,
     before: Callable[[], object],
-    ahead: Callable[[], Mapping[Part, list[Any]]] | None,
+    ahead: Callable[[], Pictures] | None,
 ) -> dict[str, list[Any]]:
     """All that is drawn, by its place on the page; in several processes."""
     known = dict[Part, list[Any]]()
@@ -66,24 +69,29 @@ def shared_by(tree: xr.DataTree) -> tuple[xr.DataTree, dict[str, Any]]:
 
 
 def parts_ahead(tree: xr.DataTree) -> list[Part]:
-    """What :func:`draw_ahead` can draw of a tree."""
+    """What :func:`draw_ahead` can draw of a tree without draws."""
     return _parts(tree, WITHOUT_DRAWS, sections.Drawing())
+
+
+def parts_of_draws(tree: xr.DataTree) -> list[Part]:
+    """What it can draw of the draws in a tree, what takes longest first."""
+    return _parts(tree, OF_DRAWS, sections.Drawing())
 
 
 def draw_ahead(
     shared: tuple[xr.DataTree, Mapping[str, Any]], part: Part
 ) -> tuple[Part, list[Any]] | None:
-    """One figure, which needs neither draws nor a summary, or none; None where that fails.
+    """One figure, which needs no summary, or none; None where that fails.
 
     Parameters
     ----------
     shared : tuple
         Of :func:`shared_by`.
     part : (str, int)
-        Of a kind in :data:`WITHOUT_DRAWS`.
+        Of a kind in :data:`WITHOUT_DRAWS` or :data:`OF_DRAWS`.
     """
     kind, number = part
-    drawn, failed = _draw(shared, (*WITHOUT_DRAWS[kind], number))
+    drawn, failed = _draw(shared, (*(WITHOUT_DRAWS | OF_DRAWS)[kind], number))
     return None if failed else (part, drawn)
 
 
@@ -106,10 +114,10 @@ def _makers(summary: dict[str, Any]) -> dict[str, tuple[str, Maker]]:
         proposal = partial(sections.proposal_figure, entry=entry)
         makers[f"proposal {number}"] = ("the next run", proposal)
     return makers | {
-        "trace": ("the sampler's chains", sections.trace_figures),
+        "trace": OF_DRAWS["trace"],
         **{name: WITHOUT_DRAWS[name] for name in last},
-        "predictive": ("the posterior's prediction", sections.predictive_figures),
-        "posterior": ("the posterior", sections.posterior_figures),
+        "predictive": OF_DRAWS["predictive"],
+        "posterior": OF_DRAWS["posterior"],
     }
 
 
@@ -155,4 +163,11 @@ WITHOUT_DRAWS: dict[str, tuple[str, Maker]] = {
     "formulas": ("the equations", _formulas),
     "fit": ("the fit", sections.fit_figures),
     "response": ("the frequency response", sections.response_figures),
+}
+
+#: The same of the draws, what takes longest first.
+OF_DRAWS: dict[str, tuple[str, Maker]] = {
+    "posterior": ("the posterior", sections.posterior_figures),
+    "predictive": ("the posterior's prediction", sections.predictive_figures),
+    "trace": ("the sampler's chains", sections.trace_figures),
 }

@@ -10,13 +10,15 @@ import math
 import os
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
 
 import xarray as xr
 
+from bayesoleo import _schema as schema
 from bayesoleo._first_compilation import is_marked
+from bayesoleo._report.page_figures import Pictures
 from bayesoleo._types import ProgressCallback
 from bayesoleo._worker_processes import Beside, start_ahead
 from bayesoleo._workflow.estimating import NOT_SAMPLED, draw, inference_for
@@ -45,6 +47,7 @@ from bayesoleo._workflow.structures_beside import (
     Early,
     answered,
     begun_beside,
+    pictures_meanwhile,
     pictures_of,
 )
 from bayesoleo._workflow.task import Source, Task, prepare, silent
@@ -179,10 +182,11 @@ def close(
             )
             if beside is not None:
                 groups = _groups_of(task, loop, drawn, stages, known)
+                here = _drawn_meanwhile(task, loop, groups, beside, output, callback)
                 if not first:
                     callback("compare structures")
                     loop, questions = with_structures(task, loop, beside.result(), stages)
-                ahead = partial(pictures_of, beside)
+                ahead = partial(_all_drawn, beside, here)
         return written(task, loop, drawn, output, stages, questions, groups, ahead)
 
 
@@ -218,6 +222,29 @@ def _groups_of(
     except Exception:
         del stages.failed[failed:]
         return None
+
+
+def _drawn_meanwhile(
+    task: Task,
+    loop: ClosedLoop,
+    groups: Groups | None,
+    beside: Beside[Asked, Answer],
+    output: ResultFolder,
+    callback: ProgressCallback,
+) -> Pictures:
+    """Figures of the draws, where a report is to be written; none where that fails, which is told
+    when they are drawn again."""
+    if groups is None or output.folder is None or schema.POSTERIOR not in groups:
+        return {}
+    callback("draw the posterior")
+    with suppress(Exception):
+        return pictures_meanwhile(beside, finish(task, groups, loop.final.fit))
+    return {}
+
+
+def _all_drawn(beside: Beside[Asked, Answer], here: Pictures) -> Pictures:
+    """Figures that the other process has drawn, and those from here."""
+    return {**pictures_of(beside), **here}
 
 
 def with_structures(

@@ -21,7 +21,7 @@ import xarray as xr
 
 from bayesoleo import _schema as schema
 from bayesoleo._report.page import write_report
-from bayesoleo._report.page_figures import Part
+from bayesoleo._report.page_figures import Pictures
 from bayesoleo._report.sentences import headline, response_entries
 from bayesoleo._report.terminal import write_plain_report
 from bayesoleo._storage.files import (
@@ -305,7 +305,7 @@ def reason_of(error: Exception) -> str:
 
 Drawn = tuple[Samples, LogDensity]
 Groups = dict[str, xr.Dataset]
-Ahead = Callable[[], Mapping[Part, list[Any]]]
+Ahead = Callable[[], Pictures]
 
 
 def write_result(

@@ -1,5 +1,7 @@
 """Probabilities of structures, and the runs that would tell them apart, computed in another process
 while this one draws from the posterior, which does not depend on them; then figures of the search.
+
+While this one would wait for the answer, it draws figures of the posterior.
 """
 
 from __future__ import annotations
@@ -12,7 +14,14 @@ from typing import Any, Self
 import xarray as xr
 
 from bayesoleo._parallel import single_blas_thread
-from bayesoleo._report.page_figures import Part, draw_ahead, parts_ahead, shared_by
+from bayesoleo._report.page_figures import (
+    Part,
+    Pictures,
+    draw_ahead,
+    parts_ahead,
+    parts_of_draws,
+    shared_by,
+)
 from bayesoleo._types import ProgressCallback
 from bayesoleo._worker_processes import Beside, start_ahead
 from bayesoleo._workflow.output import PROPOSALS_STAGE, SEARCH_STAGE, reason_of
@@ -175,6 +184,21 @@ class Early[K]:
             self._beside.drop()
 
 
-def pictures_of(beside: Beside[Asked, Answer]) -> dict[Part, list[Any]]:
+def pictures_of(beside: Beside[Asked, Answer]) -> Pictures:
     """The figures that it has drawn."""
     return dict(drawn for drawn in beside.taken().values() if drawn is not None)
+
+
+def pictures_meanwhile(beside: Beside[Asked, Answer], drawn: xr.DataTree) -> Pictures:
+    """Figures of the draws in a tree, drawn here until the other process has its answer.
+
+    The first takes longest, and is drawn in any case: the other one goes on with its own figures,
+    and what takes longest is not to be left to the end.
+    """
+    found = dict[Part, list[Any]]()
+    shared = shared_by(drawn)
+    for part in parts_of_draws(drawn):
+        if found and beside.answered:
+            break
+        found |= dict(filter(None, [draw_ahead(shared, part)]))
+    return found

@@ -181,9 +181,7 @@ def colour_of(lines: Sequence[Lines]) -> tuple[tuple[float, float], float]:
     white, _ = cost(np.array([-40.0, 0.0]))
     starts = [np.array([s, np.log(t)]) for s in (-1.0, 3.0) for t in (1.0, 10.0, 60.0)]
     bounds = [(-8.0, 12.0), (np.log(0.2), np.log(1e4))]
-    found = [
-        optimize.minimize(cost, x, jac=True, method="L-BFGS-B", bounds=bounds) for x in starts
-    ]
+    found = [optimize.minimize(cost, x, jac=True, method="L-BFGS-B", bounds=bounds) for x in starts]
     best = min(found, key=lambda one: float(one.fun))
     p_value = float(stats.chi2.sf(2 * max(white - float(best.fun), 0.0), 2))
     share = MOST_SHARE * float(expit(best.x[0]))

@@ -6,6 +6,7 @@ import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,11 +15,12 @@ from small_campaigns import DAMPER_RUNS, FRICTION, damper, damper_campaign
 
 from bayesoleo import _schema as schema, _workflow as workflow
 from bayesoleo._report.page import render_report
-from bayesoleo._report.page_figures import draw_ahead, parts_ahead, shared_by
+from bayesoleo._report.page_figures import draw_ahead, parts_ahead, parts_of_draws, shared_by
 from bayesoleo._storage.result_files import read_tree
 from bayesoleo._workflow import closing, structures_beside
 from bayesoleo._workflow.predicting import predict
 from bayesoleo._workflow.settings import Settings
+from bayesoleo._workflow.structures_beside import pictures_meanwhile
 from bayesoleo.assessment import assess
 from bayesoleo.effects import find_effect
 from bayesoleo.errors import BayesoleoError, InputError
@@ -241,16 +243,28 @@ def test_figures_drawn_ahead_are_those_of_the_result(closed, campaign, tmp_path,
         drawn.update(rightly(beside))
         return drawn
 
+    def all_here(beside, tree):
+        found = pictures_meanwhile(SimpleNamespace(answered=False), tree)
+        drawn.update(found)
+        return found
+
     monkeypatch.setattr(closing, "pictures_of", whole)
+    monkeypatch.setattr(closing, "pictures_meanwhile", all_here)
     tree = workflow.close(campaign, MODEL, replace(SETTINGS, jobs=2), out=tmp_path)
-    assert list(drawn) == parts_ahead(tree)
+    assert set(drawn) == {*parts_ahead(tree), *parts_of_draws(tree)}
     shown = {kind for (kind, _), figures in drawn.items() if figures}
-    assert {"residual", "data", "fit", "formulas"} <= shown
+    assert {"residual", "data", "fit", "formulas", "posterior", "predictive", "trace"} <= shown
     shared = shared_by(tree)
     for part, figures in drawn.items():
         assert draw_ahead(shared, part) == (part, figures)
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert page == render_report(read_tree(tmp_path / "results.nc"))
+
+
+def test_no_more_is_drawn_than_what_takes_longest_when_nobody_waits(closed):
+    tree, _ = closed
+    drawn = pictures_meanwhile(SimpleNamespace(answered=True), tree)
+    assert list(drawn) == parts_of_draws(tree)[:1] == [("posterior", 0)]
 
 
 @pytest.mark.slow
