@@ -471,7 +471,7 @@ class Beside[S, R]:
 
     @property
     def answered(self) -> bool:
-        """Whether nobody waits any more: the call is done, or the process was lost."""
+        """Whether :meth:`result` need not wait: the call is done, or the process was lost."""
         return self._answered.is_set()
 
     def result(self) -> R:

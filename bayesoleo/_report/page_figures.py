@@ -81,7 +81,7 @@ def parts_of_draws(tree: xr.DataTree) -> list[Part]:
 def draw_ahead(
     shared: tuple[xr.DataTree, Mapping[str, Any]], part: Part
 ) -> tuple[Part, list[Any]] | None:
-    """One figure, which needs no summary, or none; None where that fails.
+    """One figure, which needs nothing of structures, or none; None where that fails.
 
     Parameters
     ----------

@@ -182,11 +182,11 @@ def close(
             )
             if beside is not None:
                 groups = _groups_of(task, loop, drawn, stages, known)
-                here = _drawn_meanwhile(task, loop, groups, beside, output, callback)
+                pictures = _pictures_of_draws(task, loop, drawn, groups, output, beside, callback)
                 if not first:
                     callback("compare structures")
                     loop, questions = with_structures(task, loop, beside.result(), stages)
-                ahead = partial(_all_drawn, beside, here)
+                ahead = partial(_all_pictures, beside, pictures)
         return written(task, loop, drawn, output, stages, questions, groups, ahead)
 
 
@@ -224,27 +224,30 @@ def _groups_of(
         return None
 
 
-def _drawn_meanwhile(
+def _pictures_of_draws(
     task: Task,
     loop: ClosedLoop,
+    drawn: Drawn | None,
     groups: Groups | None,
-    beside: Beside[Asked, Answer],
     output: ResultFolder,
+    beside: Beside[Asked, Answer],
     callback: ProgressCallback,
 ) -> Pictures:
-    """Figures of the draws, where a report is to be written; none where that fails, which is told
-    when they are drawn again."""
+    """Figures of the posterior, where a report is to be written; none where that fails, which is
+    told when they are drawn again."""
     if groups is None or output.folder is None or schema.POSTERIOR not in groups:
         return {}
-    callback("draw the posterior")
+    callback("draw figures of the posterior")
     with suppress(Exception):
-        return pictures_meanwhile(beside, finish(task, groups, loop.final.fit))
+        # With a summary: of many parameters, figures show those of the effects that were added.
+        tree, _ = result_tree(task, loop, drawn, output, Stages(), (), groups)
+        return pictures_meanwhile(beside, tree)
     return {}
 
 
-def _all_drawn(beside: Beside[Asked, Answer], here: Pictures) -> Pictures:
+def _all_pictures(beside: Beside[Asked, Answer], pictures: Pictures) -> Pictures:
     """Figures that the other process has drawn, and those from here."""
-    return {**pictures_of(beside), **here}
+    return {**pictures_of(beside), **pictures}
 
 
 def with_structures(

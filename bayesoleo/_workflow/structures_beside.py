@@ -189,16 +189,15 @@ def pictures_of(beside: Beside[Asked, Answer]) -> Pictures:
     return dict(drawn for drawn in beside.taken().values() if drawn is not None)
 
 
-def pictures_meanwhile(beside: Beside[Asked, Answer], drawn: xr.DataTree) -> Pictures:
+def pictures_meanwhile(beside: Beside[Asked, Answer], tree: xr.DataTree) -> Pictures:
     """Figures of the draws in a tree, drawn here until the other process has its answer.
 
-    The first takes longest, and is drawn in any case: the other one goes on with its own figures,
-    and what takes longest is not to be left to the end.
+    The first takes longest of all figures, and is drawn in any case: begun last, it would be waited
+    for when everything else is done.
     """
-    found = dict[Part, list[Any]]()
-    shared = shared_by(drawn)
-    for part in parts_of_draws(drawn):
-        if found and beside.answered:
+    found, shared = dict[Part, list[Any]](), shared_by(tree)
+    for number, part in enumerate(parts_of_draws(tree)):
+        if number and beside.answered:
             break
         found |= dict(filter(None, [draw_ahead(shared, part)]))
     return found

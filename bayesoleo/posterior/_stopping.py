@@ -39,8 +39,6 @@ class Schedule:
         Warm-up rounds at most.
     least_rounds : int
         Warm-up rounds before proposals of the mixture that are accepted may end it.
-    warm_times : float
-        Draws of a warm-up round, in autocorrelation times, that end it.
     least : int
         Kept draws of each walker before the stopping rule is applied.
     times : float
@@ -54,7 +52,6 @@ class Schedule:
     warm_up: int
     most_rounds: int
     least_rounds: int
-    warm_times: float
     least: int
     times: float
     segment: int

@@ -92,7 +92,7 @@ def test_ensembles_that_agree_pass_the_limit():
     assert 2 <= np.sum(rhat > rhat_limit(4, 400)) <= 38
 
 
-ONCE = Schedule(1000.0, 10**6, 20, 6, 2, 10.0, 50, 20.0, 100)
+ONCE = Schedule(1000.0, 10**6, 20, 6, 2, 50, 20.0, 100)
 
 
 @pytest.mark.parametrize(

@@ -103,6 +103,39 @@ def test_quantiles_of_quick_runs_err_by_what_their_effective_size_says(far):
     assert abs(scaled.mean(axis=(0, 1))).max() < 4 / np.sqrt(240)
 
 
+class Skirted(Gaussian):
+    """A fifth of the weight lies in a skirt that is six times as wide, in the first coordinate: the
+    normal density about the mode says nothing of it."""
+
+    def __init__(self):
+        super().__init__(np.ones(2))
+
+    def __call__(self, phi):
+        self.evaluations += len(phi)
+        core, skirt = -0.5 * phi[:, 0] ** 2, -0.5 * (phi[:, 0] / 6) ** 2
+        height = np.logaddexp(np.log(0.8) + core, np.log(0.2 / 6) + skirt) - 0.5 * phi[:, 1] ** 2
+        return height, np.column_stack([0.25 * height, 0.75 * height])
+
+    def below(self, x):
+        return 0.8 * norm.cdf(x) + 0.2 * norm.cdf(x / 6)
+
+
+@pytest.mark.statistical
+def test_a_tail_that_the_mode_says_nothing_of_is_found_by_a_quick_run():
+    errors = []
+    for seed in range(60):
+        target = Skirted()
+        start = normal_mixture([1.02, 1.0])  # by the curvature at the mode
+        found = sample(target, start, seed=seed, quick=True, progress=False, climbs=0)
+        below = target.below(found.draws[..., 0])
+        both = np.array([np.mean(below <= 0.05) - 0.05, np.mean(below > 0.95) - 0.05])
+        errors.append(both * np.sqrt(found.effective_size[0] / (0.05 * 0.95)))
+    # Of a density so far from any mixture the error is up to half more than stated. Where warm-up
+    # began with rounds of five draws it was 2.4 times as much, and more than half on one side.
+    assert np.sqrt(np.mean(np.square(errors), axis=0)).max() < 1.9
+    assert np.mean(errors, axis=0).min() > -1.1
+
+
 @pytest.mark.slow
 def test_a_curved_density_that_no_mixture_fits():
     target = Banana(np.ones(4))
@@ -139,8 +172,7 @@ def test_a_first_look_warms_up_once_where_the_mixture_is_the_posterior(monkeypat
         assert samples.reached
         within_error(samples, np.zeros(3), sd)
         rounds[name] = phases.count("warm-up")
-    # Rounds of a quick run have 5, 10 and 20 draws, those of a full one 20 and 40.
-    assert rounds == {"near": 1, "far": 3, "full": 2}
+    assert rounds == {"near": 1, "far": 2, "full": 2}
 
 
 def test_proposals_of_a_mixture_that_misses_are_fewer_already_in_the_warm_up(monkeypatch):
@@ -154,8 +186,9 @@ def test_proposals_of_a_mixture_that_misses_are_fewer_already_in_the_warm_up(mon
     sd = np.ones(6)
     mixture = normal_mixture(sd, stretch=30.0)
     found = sample(Gaussian(sd), mixture, seed=1, quick=True, progress=False, climbs=0)
-    # In rounds of 5 and 10 draws walkers still come in from afar, by proposals that are accepted.
-    assert shares[:4] == [0.8, 0.8, 0.8, 0.3]
+    first, second = shares[:2]
+    assert first == 0.8
+    assert second == 0.3
     # With 80 % of them it took 38 320, of which 9 in 100 were accepted in the end.
     assert found.reached
     assert found.evaluations < 25_000
@@ -175,7 +208,7 @@ def test_a_quick_run_hands_on_draws_that_tell_something_new():
     chains, draws, _ = few.draws.shape
     assert chains * draws >= 1000
     tau = few.autocorrelation_time
-    assert tau.min() > 8
+    assert tau.min() > 10
     kept = few.evaluations // chains
     assert draws < kept / (tau.min() - 1)
     assert len(few.failed) == len(few.log_density[0]) == draws
@@ -201,7 +234,7 @@ def test_a_quick_run_hands_on_enough_of_draws_that_are_nearly_independent():
     few = sample(Gaussian(sd), normal_mixture(sd), seed=1, quick=True, progress=False, climbs=0)
     chains, draws, _ = few.draws.shape
     assert few.autocorrelation_time.max() < 3
-    assert 1000 <= chains * draws < few.evaluations < 2000
+    assert 1000 <= chains * draws < 2000 <= few.evaluations < 3000
     own = effective_size(few.draws)
     # Scatter of an estimate from chains of about ten draws.
     assert own.min() > 0.6 * few.effective_size.min()
