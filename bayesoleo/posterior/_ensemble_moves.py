@@ -398,7 +398,8 @@ class Ensembles:
     weights: MoveWeights = MoveWeights()
 
     def __post_init__(self) -> None:
-        least = 2 * (len(self.log_density.names) + 1)
+        # Of one unknown too, a snooker step is made by three walkers of the other half.
+        least = max(2 * (len(self.log_density.names) + 1), 6)
         if self.walkers < least or self.walkers % 2:
             raise InputError(
                 "an ensemble needs an even number of walkers that spans the space twice",

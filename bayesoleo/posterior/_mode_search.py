@@ -203,7 +203,7 @@ def _spread(distance: Array, values: Array, climbs: int, rng: np.random.Generato
     """
     if len(values) <= climbs:
         return np.arange(len(values))
-    bands = np.array_split(np.argsort(distance, kind="stable"), climbs // 2)
+    bands = np.array_split(np.argsort(distance, kind="stable"), max(climbs // 2, 1))
     best = np.array([band[np.argmax(values[band])] for band in bands])
     others = rng.permutation(np.setdiff1d(np.arange(len(values)), best))
     return np.concatenate([best, others[: climbs - best.size]])

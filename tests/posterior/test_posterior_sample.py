@@ -392,6 +392,14 @@ def test_settings_that_cannot_work_are_refused(settings, match):
         sample(Gaussian(np.ones(3)), normal_mixture(np.ones(2)), seed=1, progress=False)
 
 
+def test_one_unknown_takes_six_walkers_and_one_climb():
+    settings = {"seed": 1, "quick": True, "progress": False, "ensembles": 2}
+    start = normal_mixture([1.0])
+    with pytest.raises(InputError, match="even number from 6"):
+        sample(Gaussian(np.ones(1)), start, walkers=4, **settings)
+    assert sample(Gaussian(np.ones(1)), start, walkers=6, climbs=1, **settings).reached
+
+
 def test_a_bar_is_shown(capsys):
     sample(Gaussian(np.ones(2)), normal_mixture(np.ones(2)), seed=1, quick=True)
     assert "200/200" in capsys.readouterr().err
