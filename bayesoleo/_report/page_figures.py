@@ -74,7 +74,7 @@ def parts_ahead(tree: xr.DataTree) -> list[Part]:
 
 
 def parts_of_draws(tree: xr.DataTree) -> list[Part]:
-    """What it can draw of the draws in a tree, what takes longest first."""
+    """What it can draw of the draws in a tree, what takes longest last."""
     return _parts(tree, OF_DRAWS, sections.Drawing())
 
 
@@ -165,9 +165,9 @@ WITHOUT_DRAWS: dict[str, tuple[str, Maker]] = {
     "response": ("the frequency response", sections.response_figures),
 }
 
-#: The same of the draws, what takes longest first.
+#: The same of the draws, what takes longest last.
 OF_DRAWS: dict[str, tuple[str, Maker]] = {
-    "posterior": ("the posterior", sections.posterior_figures),
-    "predictive": ("the posterior's prediction", sections.predictive_figures),
     "trace": ("the sampler's chains", sections.trace_figures),
+    "predictive": ("the posterior's prediction", sections.predictive_figures),
+    "posterior": ("the posterior", sections.posterior_figures),
 }

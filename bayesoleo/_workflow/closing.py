@@ -235,7 +235,8 @@ def _pictures_of_draws(
 ) -> Pictures:
     """Figures of the posterior, where a report is to be written; none where that fails, which is
     told when they are drawn again."""
-    if groups is None or output.folder is None or schema.POSTERIOR not in groups:
+    nothing = groups is None or output.folder is None or schema.POSTERIOR not in groups
+    if nothing or beside.answered:
         return {}
     callback("draw figures of the posterior")
     with suppress(Exception):

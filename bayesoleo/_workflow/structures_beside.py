@@ -192,12 +192,11 @@ def pictures_of(beside: Beside[Asked, Answer]) -> Pictures:
 def pictures_meanwhile(beside: Beside[Asked, Answer], tree: xr.DataTree) -> Pictures:
     """Figures of the draws in a tree, drawn here until the other process has its answer.
 
-    The first takes longest of all figures, and is drawn in any case: begun last, it would be waited
-    for when everything else is done.
+    No more of them: that process draws too once it has answered, and this one has to write.
     """
     found, shared = dict[Part, list[Any]](), shared_by(tree)
-    for number, part in enumerate(parts_of_draws(tree)):
-        if number and beside.answered:
+    for part in parts_of_draws(tree):
+        if beside.answered:
             break
         found |= dict(filter(None, [draw_ahead(shared, part)]))
     return found

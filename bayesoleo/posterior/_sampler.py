@@ -30,7 +30,6 @@ from bayesoleo.posterior._log_density import Density, LogDensity
 from bayesoleo.posterior._mixture import Mixture
 from bayesoleo.posterior._mode_search import with_other_modes
 from bayesoleo.posterior._stopping import (
-    ENOUGH_QUICK,
     ProgressBar,
     Quality,
     Schedule,
@@ -182,7 +181,7 @@ def sample(
     if quick:
         most = max(_quick_evaluations(log_density), QUICK_STEPS * group.chains)
         max_evaluations = min(max_evaluations, most)
-    schedule = _schedule(effective_size, max_evaluations, segment, quick, group.chains)
+    schedule = _schedule(effective_size, max_evaluations, segment, quick)
     print_of_run = _fingerprint(fingerprint, group, start, seed, schedule, number)
     with open_store(place, print_of_run) as store, connected(scheduler) as client:
         if client is not None:
@@ -282,15 +281,9 @@ def _quick_evaluations(log_density: Density) -> int:
     return min(QUICK_EVALUATIONS, QUICK_TIME_STEPS // max(steps, 1))
 
 
-def _schedule(
-    effective_size: float, evaluations: int, segment: int, quick: bool, walkers: int = 1
-) -> Schedule:
-    """Schedule of ensembles with so many walkers in all, or of the no-U-turn sampler."""
+def _schedule(effective_size: float, evaluations: int, segment: int, quick: bool) -> Schedule:
     if quick:
-        # Many walkers keep enough draws in a few moves. Warm-up is not shortened for them: after
-        # five draws they still sit where the mixture put them, and a tail that it misses is missed.
-        least = min(16, max(8, -(-ENOUGH_QUICK // walkers)))
-        return Schedule(min(effective_size, 200.0), evaluations, 20, 3, 1, least, 5.0, segment)
+        return Schedule(min(effective_size, 200.0), evaluations, 20, 3, 1, 16, 5.0, segment)
     return Schedule(effective_size, evaluations, 20, 6, 2, 50, 20.0, segment)
 
 

@@ -18,6 +18,7 @@ from bayesoleo import _schema as schema, _workflow as workflow
 from bayesoleo._report.page import render_report
 from bayesoleo._report.page_figures import draw_ahead, parts_ahead, parts_of_draws, shared_by
 from bayesoleo._storage.result_files import read_tree
+from bayesoleo._worker_processes import Beside
 from bayesoleo._workflow import closing, structures_beside
 from bayesoleo._workflow.predicting import predict
 from bayesoleo._workflow.settings import Settings
@@ -249,10 +250,11 @@ def test_figures_drawn_ahead_are_those_of_the_result(closed, campaign, tmp_path,
         return drawn
 
     def all_here(beside, tree):
-        found = pictures_meanwhile(SimpleNamespace(answered=False), tree)
+        found = pictures_meanwhile(beside, tree)
         drawn.update(found)
         return found
 
+    monkeypatch.setattr(Beside, "answered", False)  # whatever is waited for takes as long
     monkeypatch.setattr(closing, "pictures_of", whole)
     monkeypatch.setattr(closing, "pictures_meanwhile", all_here)
     tree = workflow.close(campaign, MODEL, replace(SETTINGS, jobs=2), out=tmp_path)
@@ -267,10 +269,22 @@ def test_figures_drawn_ahead_are_those_of_the_result(closed, campaign, tmp_path,
     assert page == render_report(read_tree(tmp_path / "results.nc"))
 
 
-def test_no_more_is_drawn_than_what_takes_longest_when_nobody_waits(closed):
+def test_nothing_is_drawn_meanwhile_once_there_is_an_answer(closed):
     tree, _ = closed
-    drawn = pictures_meanwhile(SimpleNamespace(answered=True), tree)
-    assert list(drawn) == parts_of_draws(tree)[:1] == [("posterior", 0)]
+
+    class Answering:
+        """After one figure."""
+
+        asked = 0
+
+        @property
+        def answered(self):
+            self.asked += 1
+            return self.asked > 1
+
+    assert pictures_meanwhile(SimpleNamespace(answered=True), tree) == {}
+    drawn = pictures_meanwhile(Answering(), tree)
+    assert list(drawn) == parts_of_draws(tree)[:1] == [("trace", 0)]
 
 
 @pytest.mark.slow
