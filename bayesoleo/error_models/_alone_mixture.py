@@ -61,9 +61,9 @@ def moments_of(found: Sequence[Components], weights: Array) -> tuple[float, Arra
         away = one.mean - centre
         within = none[k] * one.variance + np.sum(alone[k] * one.variances)
         cross = np.outer(away, taken[k])
-        cross += cross.T.copy()  # first: one after the other would round it to no symmetric matrix
         outer = np.sum(alone[k] * (one.widened * one.variances + one.moved**2), axis=1)
         half = one.directions * np.sqrt(outer)
         spread += within * one.covariance + shares[k] * np.outer(away, away)
-        spread += half @ half.T - cross
+        # Taken off one after the other, the two would round to no symmetric matrix.
+        spread += half @ half.T - (cross + cross.T)
     return float(weights.sum()), centre, spread
