@@ -49,6 +49,8 @@ if TYPE_CHECKING:
 
 #: Families that a change of a term may be one of, in other words.
 FORCES = frozenset({TERMS, "damping", "friction", "stiffness"})
+#: Samples of all candidates that are multiplied at a time.
+SAMPLES_AT_A_TIME = 2048
 #: Degrees of freedom of a variance that is not measured.
 ASSUMED = 1e9
 
@@ -443,16 +445,28 @@ def effective_tests(
     statistic has the distribution of the largest of ``m`` independent ones, and ``m`` is read off
     at the median (Westfall and Young 1993, max-T; Sidak 1967).
     """
-    columns = np.concatenate([score.columns for score in scores]) if scores else np.zeros((0, 1))
-    if columns.shape[0] < 2:
+    if sum(len(score.columns) for score in scores) < 2:
         return 1.0
     with single_blas_thread():  # of a few hundred columns threads only get in each other's way
-        values, vectors = np.linalg.eigh(columns @ columns.T)
+        values, vectors = np.linalg.eigh(_products([score.columns for score in scores]))
         root = vectors * np.sqrt(np.clip(values, 0.0, None))
         draws = np.random.default_rng(seed).standard_normal((policy.search_draws, values.size))
         largest = np.abs(draws @ root.T).max(axis=1)
     smallest_p = 2 * stats.norm.sf(np.median(largest))
     return float(max(1.0, np.log(0.5) / np.log1p(-smallest_p)))
+
+
+def _products(columns: Sequence[Array]) -> Array:
+    """Products of all columns with each other, a part of the samples at a time: one array of them
+    all takes longer to fill than to multiply."""
+    size, samples = sum(map(len, columns)), columns[0].shape[1]
+    found, part = np.zeros((size, size)), np.empty((size, min(samples, SAMPLES_AT_A_TIME)))
+    for first in range(0, samples, SAMPLES_AT_A_TIME):
+        chosen = slice(first, first + SAMPLES_AT_A_TIME)
+        here = part[:, : min(samples - first, SAMPLES_AT_A_TIME)]
+        np.concatenate([one[:, chosen] for one in columns], out=here)
+        found += here @ here.T
+    return found
 
 
 def corrected_p(score: Score, tests: float) -> float:

@@ -12,7 +12,15 @@ from small_campaigns import damper, damper_campaign, spring_damper_force
 
 from bayesoleo.discovery._assembly import Assembly, Roles
 from bayesoleo.discovery._policy import SearchPolicy
-from bayesoleo.discovery._score_tests import Score, classes, corrected_p, effective_tests, score_all
+from bayesoleo.discovery._score_tests import (
+    SAMPLES_AT_A_TIME,
+    Score,
+    _products,
+    classes,
+    corrected_p,
+    effective_tests,
+    score_all,
+)
 from bayesoleo.discovery._state import fit_state
 
 
@@ -70,6 +78,15 @@ def test_correlated_columns_lie_between_and_shapes_count():
     assert 1.5 < found < 15
     scan = score(np.eye(10))
     assert effective_tests([scan, score(np.eye(10)[0])], seed=1) == pytest.approx(10, rel=0.12)
+
+
+@pytest.mark.parametrize("samples", [1, SAMPLES_AT_A_TIME, 2 * SAMPLES_AT_A_TIME + 7])
+def test_products_of_columns_are_those_of_all_samples(samples):
+    rng = np.random.default_rng(3)
+    columns = [rng.normal(size=(k, samples)) for k in (2, 1, 0, 3)]
+    whole = np.concatenate(columns)
+    # Sums of so many products of numbers about one, in another order.
+    np.testing.assert_allclose(_products(columns), whole @ whole.T, atol=1e-12 * samples)
 
 
 def test_no_search_is_one_test():
