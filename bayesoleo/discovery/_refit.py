@@ -272,6 +272,8 @@ def refit_at(base: Base, score: Score, assembly: Assembly, fit: ModelFit) -> Ref
     fall = share * base.fall_back
     reached = base.excess - fall < base.feigned
     price = schwarz_price(base)
+    # Its predictions are kept; those of the estimator are the same, and as large.
+    fit.problem.forget()
     return Refit(
         score, grown, fit, share, contribution, remaining, noise, fall, reached, price,
         base.policy, base.feigned,

@@ -139,6 +139,10 @@ class CampaignProblem:
             self._last = (np.array(theta), self._evaluate(theta))
         return self._last[1]
 
+    def forget(self) -> None:
+        """Free the memory of the last vector: one asked for again is solved again."""
+        self._last = None
+
     def residuals_first(self, theta: Array) -> Evaluation | None:
         """Residuals at one vector without sensitivities, where they cost far less; else None.
 
