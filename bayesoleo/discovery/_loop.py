@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy import stats
@@ -30,7 +31,7 @@ from bayesoleo.discovery._judged_together import TOGETHER, judged_together
 from bayesoleo.discovery._nonparametric_round import nonparametric_notes, with_nonparametric
 from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._policy import SearchPolicy
-from bayesoleo.discovery._ranking import ABSORBING_FAMILIES, Ranked
+from bayesoleo.discovery._ranking import ABSORBING_FAMILIES, Ranked, prepare_options
 from bayesoleo.discovery._review import reviewed
 from bayesoleo.discovery._round import JUDGED, Progress, Round, examine
 from bayesoleo.discovery._scanned_columns import Scanned
@@ -370,7 +371,7 @@ def close_loop(
     ClosedLoop
     """
     if known is None:
-        known = _begun(assembly, roles, numerics, declared, callback)
+        known = _begun(assembly, roles, numerics, declared, effects, callback)
         keep(known)
     search = SearchOptions(
         roles, numerics, effects, seed, max_effects, nonparametric, keep, callback, keep_columns,
@@ -635,6 +636,7 @@ def _begun(
     roles: Roles,
     numerics: Numerics,
     declared: ModelFit | None,
+    effects: Sequence[Effect] | None,
     callback: ProgressCallback,
 ) -> Progress:
     """The declared model, estimated."""
@@ -645,7 +647,7 @@ def _begun(
         state = state_of(assembly, declared, roles)
     if not state.at_floor:
         callback("the residual exceeds the expected error: try other starts")
-        start = better_start(state.fit, numerics)
+        start = better_start(state.fit, numerics, partial(_prepare, state, effects))
         if start is not None:
             before = state.fit.point.objective
             state = fit_state(assembly, roles, numerics, start=start, progress=callback)
@@ -654,6 +656,12 @@ def _begun(
                 " the declared values and priors"
             )
     return Progress(state, state, notes=tuple(notes))
+
+
+def _prepare(state: State, effects: Sequence[Effect] | None) -> None:
+    """Look for the candidates of the first round; that has no need of a second core."""
+    if not state.unsolved:
+        prepare_options(state.base(), state.assembly, effects)
 
 
 def loop_of(progress: Progress, roles: Roles) -> ClosedLoop:

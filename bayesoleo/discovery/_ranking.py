@@ -11,6 +11,7 @@ in a thousand. Without one no periodic force is scored, and the search needs no 
 from __future__ import annotations
 
 import itertools
+import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -296,6 +297,30 @@ class Ranked:
         return self.score.option.candidate.family in ABSORBING_FAMILIES
 
 
+#: What was prepared last, with the base and the assembly that it is of.
+_prepared: list[tuple[weakref.ref[Base], Assembly, Sequence[Effect] | None, list[Option]]] = []
+
+
+def prepare_options(base: Base, assembly: Assembly, effects: Sequence[Effect] | None) -> None:
+    """Find the candidates that :func:`score_candidates` is asked for next, by the same arguments.
+
+    That takes as long as half an estimate, and may be done while something else has to be waited
+    for.
+    """
+    options = _options_of(base, assembly, effects)
+    _prepared[:] = [(weakref.ref(base), assembly, effects, options)]
+
+
+def _options_of(base: Base, assembly: Assembly, effects: Sequence[Effect] | None) -> list[Option]:
+    """Every effect at every place; those that were prepared are given away once."""
+    known, _prepared[:] = list(_prepared), []
+    for of, of_assembly, of_effects, options in known:
+        if of() is base and of_assembly is assembly and of_effects is effects:
+            return options
+    scales = scales_of(base.fit, assembly.drive, assembly.native)
+    return assembly.options(scales, None if effects is None else tuple(effects))
+
+
 def score_candidates(
     base: Base,
     assembly: Assembly,
@@ -333,8 +358,7 @@ def score_candidates(
     failed : dict of str to str
         Reason by effect without a score.
     """
-    scales = scales_of(base.fit, assembly.drive, assembly.native)
-    options = assembly.options(scales, None if effects is None else tuple(effects))
+    options = _options_of(base, assembly, effects)
     reasons = [lacking(option.model.inputs, base.fit.records) for option in options]
     without = {
         " at ".join(option.key): reason

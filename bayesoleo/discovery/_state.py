@@ -20,6 +20,7 @@ import numpy as np
 
 from bayesoleo._parallel import connected, each_done, thread_map
 from bayesoleo._types import Array
+from bayesoleo._worker_processes import process_map
 from bayesoleo.discovery._assembly import Assembly, Roles
 from bayesoleo.discovery._expected_error import (
     Compared,
@@ -43,13 +44,16 @@ from bayesoleo.discovery._other_starts import promising
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._run_predictions import Prediction, predict_fitted, predict_held_out
 from bayesoleo.discovery._score_basis import Base, base_of
+from bayesoleo.estimation._point_estimate import PointEstimate
 from bayesoleo.model._model import Model
 from bayesoleo.prediction._mesh_steps import steps_for
 from bayesoleo.prediction._records import Record
 from bayesoleo.prediction._stability import Stability
 
 
-def better_start(fit: ModelFit, numerics: Numerics) -> Array | None:
+def better_start(
+    fit: ModelFit, numerics: Numerics, before: Callable[[], object] = lambda: None
+) -> Array | None:
     """A better optimum of the estimate, from other starts.
 
     Parameters
@@ -57,6 +61,8 @@ def better_start(fit: ModelFit, numerics: Numerics) -> Array | None:
     fit : ModelFit
         A fit with more than the expected error.
     numerics : Numerics
+    before : callable
+        What this process does first, while another one begins with the starts.
 
     Returns
     -------
@@ -64,20 +70,26 @@ def better_start(fit: ModelFit, numerics: Numerics) -> Array | None:
         The better optimum; None if no start from draws of the priors leads to one.
     """
     best, height = None, fit.point.objective + numerics.policy.better_optimum_declared
-    for start in promising(fit.problem, fit.point.theta, numerics.policy):
-        found = fit_model(
-            fit.model,
-            fit.records,
-            replace(numerics, steps=fit.steps),
-            start=start,
-            tolerance=1e-4,
-            max_iterations=30,
-            share=fit.predictor,
-            check_mesh=False,
-        )
-        if found.point.status.ok and found.point.objective > height:
-            best, height = found.point.theta, found.point.objective
+    starts = promising(fit.problem, fit.point.theta, numerics.policy)
+    for point in process_map(_from, (fit, numerics), starts, numerics.jobs, before=before):
+        if point.status.ok and point.objective > height:
+            best, height = point.theta, point.objective
     return best
+
+
+def _from(shared: tuple[ModelFit, Numerics], start: Array) -> PointEstimate:
+    """The estimate from another start, also in another process."""
+    fit, numerics = shared
+    return fit_model(
+        fit.model,
+        fit.records,
+        replace(numerics, steps=fit.steps),
+        start=start,
+        tolerance=1e-4,
+        max_iterations=30,
+        share=fit.predictor,
+        check_mesh=False,
+    ).point
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 from fitted_states import NUMERICS
 from small_campaigns import MASS, oscillator_campaign
 
+import bayesoleo._worker_processes as processes
+from bayesoleo.discovery import _ranking
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._loop import OTHER_OPTIMUM, close_loop
+from bayesoleo.discovery._ranking import prepare_options
+from bayesoleo.discovery._state import better_start, fit_state
+from bayesoleo.effects import find_effect
 from bayesoleo.model import Model, Output, Parameter
 
 #: Driven on both sides of the resonance, and far above it.
@@ -30,6 +39,51 @@ def oscillator(resonance):
         equations={"x": f"{MASS}*ddot(x) + damping*dot(x) + stiffness*x - force"},
         outputs={"displacement": Output("x", "m")},
     )
+
+
+@pytest.fixture(scope="module")
+def beyond(tmp_path_factory):
+    """Estimated on the wrong side of the frequencies that were driven."""
+    law = partial(force, damping=3.0)
+    reduced = oscillator_campaign(tmp_path_factory.mktemp("beyond"), restoring=law, runs=RUNS)
+    return fit_state(Assembly(oscillator(17.0)), assign(reduced.records), NUMERICS)
+
+
+def force(x, v, damping):
+    return STIFFNESS * x + damping * v
+
+
+def test_the_better_start_does_not_depend_on_processes(beyond, monkeypatch):
+    alone = better_start(beyond.fit, replace(NUMERICS, jobs=1))
+    problem = beyond.fit.problem
+    assert alone[problem.names.index("stiffness")] == pytest.approx(STIFFNESS, rel=1e-2)
+    monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
+    monkeypatch.setattr(processes, "WORTH_STARTING", 0.0)
+    monkeypatch.setattr(processes, "WORTH_ASKING", 0.0)
+    asked = []
+
+    def before():  # the other process has all starts but one meanwhile
+        asked.append(beyond)
+        time.sleep(3.0)
+
+    two = better_start(beyond.fit, replace(NUMERICS, jobs=2), before)
+    np.testing.assert_array_equal(two, alone)
+    assert asked == [beyond]
+
+
+def test_candidates_that_were_prepared_are_those_that_are_scored(beyond):
+    base, assembly = beyond.base(), beyond.assembly
+    effects = (find_effect("cubic_stiffness"), find_effect("sensor_lag"))
+    other = effects[:1]
+    prepare_options(base, assembly, effects)
+    (kept,) = (options for *_, options in _ranking._prepared)
+    assert _ranking._options_of(base, assembly, effects) is kept
+    # Given away once, and to nobody else.
+    assert _ranking._options_of(base, assembly, effects) is not kept
+    prepare_options(base, assembly, effects)
+    found = _ranking._options_of(base, assembly, other)
+    assert {option.candidate.effect for option in found} == {"cubic_stiffness"}
+    assert not _ranking._prepared
 
 
 @pytest.mark.slow
