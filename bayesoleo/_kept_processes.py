@@ -69,22 +69,27 @@ class Worker:
 
     def ask(self, message: Message, known: Sequence[Any] = ()) -> tuple[str, Any]:
         """Send a message and wait for the answer: its kind and its content."""
+        self.send(message)
+        return content_of(self.answer(), known)
+
+    def send(self, message: Message) -> None:
+        """Send a message; whoever sends the next one has received the answer to this."""
         assert self.process.stdin is not None
-        assert self.process.stdout is not None
         try:
             send(cast(BinaryIO, self.process.stdin), message)
+        except (OSError, ValueError) as error:
+            raise LostError from error
+
+    def answer(self) -> Message:
+        """Wait for an answer, and receive it as it is."""
+        assert self.process.stdout is not None
+        try:
             answer = receive(cast(BinaryIO, self.process.stdout))
         except (OSError, ValueError) as error:
             raise LostError from error
         if answer is None:
             raise LostError
-        try:
-            kind, value = loads(answer, known)
-        except Exception as error:
-            raise LostError from error
-        if kind == UNREADABLE:
-            raise LostError
-        return kind, value
+        return answer
 
     def end(self) -> None:
         """End the process, and close the pipes to it."""
@@ -94,6 +99,17 @@ class Worker:
                 with suppress(OSError):
                     pipe.close()
         self.process.wait()
+
+
+def content_of(answer: Message, known: Sequence[Any] = ()) -> tuple[str, Any]:
+    """The kind and the content of an answer."""
+    try:
+        kind, value = loads(answer, known)
+    except Exception as error:
+        raise LostError from error
+    if kind == UNREADABLE:
+        raise LostError
+    return kind, value
 
 
 def _paths() -> str:

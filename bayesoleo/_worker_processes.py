@@ -24,6 +24,7 @@ from bayesoleo._kept_processes import (
     VALUE,
     LostError,
     Worker,
+    content_of,
     forget,
     kept,
     kill_processes,
@@ -36,6 +37,9 @@ from bayesoleo._process_messages import Message, as_it_is, dumps, loads
 #: Seconds of work left, as far as can be seen, from which processes that run already are asked,
 #: and from which one is started.
 WORTH_ASKING, WORTH_STARTING = 0.5, 4.0
+#: Items that are left while a process has one in hand beside that which it does: with fewer,
+#: another one may be through before it begins with that.
+LEFT_TO_OTHERS = 4
 #: Seconds between looks at whether they are worth asking.
 LOOK = 0.05
 
@@ -163,9 +167,9 @@ class _Call:
         self.begun = time.perf_counter()
         self._sent: Message = []
 
-    def _take(self, last: bool) -> int | None:
+    def _take(self, last: bool, leaving: int = 0) -> int | None:
         with self.lock:
-            if not self.left or self.failed is not None:
+            if len(self.left) <= leaving or self.failed is not None:
                 return None
             return self.left.pop() if last else self.left.popleft()
 
@@ -197,29 +201,46 @@ class _Call:
         return [self.found[index] for index in range(len(self.items))]
 
     def help(self, number: int) -> None:
-        """Have another process do items, from the last on, once that is worth it."""
+        """Have another process do items, from the last on, once that is worth it.
+
+        What it does next is taken and made a message of while it works, and sent before its answer
+        is read: this process has other things to do, and a waiting one has not.
+        """
         while not self._worth(number):
             if not self.left:
                 return
             time.sleep(LOOK)
-        index: int | None = None
+        now: int | None = None
+        then: int | None = None
         try:
             worker = process_of(number)
             worker.ask(self._message())  # what all calls need
             objects = self.known(self.shared)
-            while (index := self._take(last=True)) is not None:
-                kind, value = worker.ask(sent((index, self.items[index]), objects), objects)
+            if (now := self._take(last=True)) is not None:
+                worker.send(sent((now, self.items[now]), objects))
+            while now is not None:
+                then = self._take(last=True, leaving=LEFT_TO_OTHERS)
+                following = None if then is None else sent((then, self.items[then]), objects)
+                answer = worker.answer()
+                if following is None and (then := self._take(last=True)) is not None:
+                    following = sent((then, self.items[then]), objects)
+                if following is not None:
+                    worker.send(following)
+                kind, value = content_of(answer, objects)
                 if kind == ERROR:
                     self.failed = value
+                    if then is not None:  # nobody waits for what it does
+                        raise LostError
                 else:
-                    self.found[index] = value
-                index = None
+                    self.found[now] = value
+                now, then = then, None
                 self.over.set()
             worker.ask(dumps((None, None, None)))  # it needs no memory until the next call
         except LostError:
             forget(number)
-            if index is not None:
-                self._give_back(index)
+            for index in (then, now):
+                if index is not None:
+                    self._give_back(index)
         except BaseException as error:  # it must not be lost with the thread
             self.failed = self.failed or error
         finally:
@@ -361,10 +382,8 @@ class Beside[S, R]:
     #: Jobs beyond which it is not begun: all of them do this call sooner than one process does.
     MOST = 3
 
-    def __init__(
-        self, function: Callable[[S], R], message: Message, more: Sequence[Message] = ()
-    ) -> None:
-        self._function, self._message, self._more = function, message, more
+    def __init__(self, function: Callable[[S], R], message: Message) -> None:
+        self._function, self._message, self._more = function, message, list[Message]()
         self._found: list[tuple[str, Any]] = []
         self._items: dict[int, Any] = {}
         self._answered, self._enough = threading.Event(), threading.Event()
@@ -392,15 +411,14 @@ class Beside[S, R]:
         jobs : int, optional
             As of :func:`process_map`.
         then : tuple of (callable, object, sequence), optional
-            Function, what all its calls need, and items of work as of :func:`process_map`, which
-            the process goes on with until :meth:`taken` is called.
+            As of :meth:`go_on_with`.
         """
         if not cls.may_begin(jobs) or not _in_use.acquire(blocking=False):
             return None
         try:
-            more = [] if then is None else [(*then[:2], None), *((0, item) for item in then[2])]
-            taken = [as_it_is(sent(one)) for one in ((0, argument), *more)]
-            made = cls(function, taken[0], taken[1:])
+            made = cls(function, as_it_is(sent((0, argument))))
+            if then is not None:
+                made.go_on_with(*then)
         except BaseException as error:
             _in_use.release()
             if isinstance(error, LostError):
@@ -408,6 +426,25 @@ class Beside[S, R]:
             raise
         made._start()
         return made
+
+    def go_on_with[T](
+        self, function: Callable[[Any, T], Any], shared: Any, items: Sequence[T]
+    ) -> None:
+        """Say what the process does after the call until :meth:`taken` is called; nothing of it
+        where it has answered before this.
+
+        Parameters
+        ----------
+        function, shared, items
+            As of :func:`process_map`, taken as they are now.
+
+        Raises
+        ------
+        LostError
+            If they cannot be sent.
+        """
+        more = [(function, shared, None), *((0, item) for item in items)]
+        self._more[:] = [as_it_is(sent(one)) for one in more]
 
     @classmethod
     def may_begin(cls, jobs: int | None = None) -> bool:

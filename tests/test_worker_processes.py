@@ -76,13 +76,22 @@ def test_what_a_process_loads_is_kept_out_of_searches_for_garbage(tmp_path):
         "import gc; from bayesoleo._kept_processes import load; before = gc.get_freeze_count();"
         " load(['lasting']); import lasting; loaded = gc.get_freeze_count();"
         " later = [[]]; load(['lasting']); assert gc.isenabled();"
-        " print(before, loaded - before >= 1000, gc.get_freeze_count() == loaded)"
+        " print(before, loaded - before >= 1000, gc.get_freeze_count() == loaded,"
+        " gc.get_threshold()[0] > 2000)"
     )
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
     environment = os.environ | {"PYTHONPATH": path}
     command = [sys.executable, "-c", code]
     said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    assert said.stdout.split() == ["0", "True", "True"]
+    assert said.stdout.split() == ["0", "True", "True", "True"]
+
+
+def test_searches_for_garbage_that_are_off_stay_off(tmp_path):
+    code = (
+        "import gc; from bayesoleo._kept_processes import load; gc.set_threshold(0);"
+        " load(['wave']); assert gc.get_threshold()[0] == 0"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_short_work_starts_no_process(monkeypatch):
@@ -152,6 +161,45 @@ def fails_late(shared, item):
 def test_an_error_is_passed_on_from_either_process(eager, where):
     with pytest.raises(ValueError, match=f"item {where}"):
         process_map(fails_late, where, range(12), 2)
+
+
+def fails_or_takes_long(parent, item):
+    if os.getpid() != parent and item == 11:
+        raise ValueError("item 11")
+    time.sleep(0.1 if os.getpid() == parent else 60.0)
+    return item
+
+
+def test_an_error_does_not_wait_for_what_a_process_has_in_hand(eager):
+    began = time.monotonic()
+    with pytest.raises(ValueError, match="item 11"):
+        process_map(fails_or_takes_long, os.getpid(), range(12), 2)
+    assert time.monotonic() - began < 30.0  # half of what the item in hand would take
+    assert len(process_map(slow_square, {"unit": 1.0}, range(4), 2)) == 4
+
+
+def test_a_process_has_its_next_item_before_its_answer_is_read(eager, monkeypatch):
+    """None of the last few: another process may be through before it begins with one."""
+    events, rightly = [], processes.content_of
+    send, answer = kept_processes.Worker.send, kept_processes.Worker.answer
+
+    def noted(name, function):
+        def called(*given):
+            events.append(name)
+            return function(*given)
+
+        return called
+
+    monkeypatch.setattr(kept_processes.Worker, "send", noted("send", send))
+    monkeypatch.setattr(kept_processes.Worker, "answer", noted("answer", answer))
+    monkeypatch.setattr(processes, "content_of", noted("read", rightly))
+    count = 3 * processes.LEFT_TO_OTHERS
+    found = process_map(slow_square, {"unit": 1.0}, range(count), 2)
+    assert [value for _, value in found] == [float(k**2) for k in range(count)]
+    # First it is told what to do, and at last that there is no more.
+    items = events[events.index("send", 1) : -2]
+    assert items[:4] == ["send", "answer", "send", "read"]
+    assert items.count("send") == items.count("answer") == items.count("read")
 
 
 def kills_its_process(parent, item):
@@ -375,6 +423,32 @@ def test_a_process_lost_in_other_work_costs_only_that(eager):
     assert beside.taken() == {0: 0.1}
     assert beside.result()[1] == 2
     assert processes.Beside.begun(where_and_twice, 3, 2).result()[1] == 6
+
+
+def test_other_work_may_be_named_once_the_call_goes_on(eager):
+    beside = processes.Beside.begun(waits_and_doubles, 1.0, 2)
+    beside.go_on_with(shifted, 100, [1, 2])
+    assert beside.result() == 2.0
+    beside._thread.join()
+    assert [value for _, value in beside.taken().values()] == [101, 102]
+    # Too late: it has answered, and ends.
+    beside = processes.Beside.begun(where_and_twice, 4, 2)
+    beside._thread.join()
+    beside.go_on_with(shifted, 100, [1, 2])
+    assert beside.result()[1] == 8
+    assert beside.taken() == {}
+    # What cannot be sent is told, and takes nothing from the call.
+    beside = processes.Beside.begun(where_and_twice, 5, 2)
+    with pytest.raises(kept_processes.LostError):
+        beside.go_on_with(shifted, 100, [Unsendable()])
+    assert beside.result()[1] == 10
+    assert beside.taken() == {}
+    assert not processes._in_use.locked()
+
+
+def waits_and_doubles(seconds):
+    time.sleep(seconds)
+    return 2 * seconds
 
 
 class Unsendable(int):

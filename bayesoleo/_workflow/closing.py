@@ -47,6 +47,7 @@ from bayesoleo._workflow.structures_beside import (
     Early,
     answered,
     begun_beside,
+    drawn_beside,
     pictures_meanwhile,
     pictures_of,
 )
@@ -154,8 +155,13 @@ def close(
     def begin(loop: ClosedLoop) -> tuple[Groups | None, Beside[Asked, Answer] | None]:
         if not settings.quick or is_long() or not Beside.may_begin(settings.jobs):
             return None, None
+        beside = begun_beside(_asked_of(task, loop), settings.jobs)
+        if beside is None:
+            return None, None
         known, shown = _shown_early(task, loop, output)
-        return known, begun_beside(_asked_of(task, loop), shown, settings.jobs)
+        if shown is not None:
+            drawn_beside(beside, shown)
+        return known, beside
 
     with output.alone(), Early(begin, settings.jobs) as early:
         loop = run_loop(

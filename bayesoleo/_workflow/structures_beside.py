@@ -110,25 +110,30 @@ def answered(asked: Asked, callback: ProgressCallback) -> Answer | None:
     return None if asked.loop.without_structures is None else answer(asked, callback)
 
 
-def begun_beside(
-    asked: Asked, shown: xr.DataTree | None, jobs: int | None
-) -> Beside[Asked, Answer] | None:
+def begun_beside(asked: Asked, jobs: int | None) -> Beside[Asked, Answer] | None:
     """The answer, which another process begins to look for; None where that has to be done here, or
     nothing is asked. Nobody is told how far the other process has come.
 
     Parameters
     ----------
     asked : Asked
-    shown : DataTree or None
-        Of the search alone: once the process has the answer it draws figures of this until they are
-        wanted.
     jobs : int, optional
         Processes, this one included.
     """
-    if asked.loop.without_structures is None:
-        return None
-    then = None if shown is None else (draw_ahead, shared_by(shown), parts_ahead(shown))
-    return Beside.begun(answer, asked, jobs, then)
+    return None if asked.loop.without_structures is None else Beside.begun(answer, asked, jobs)
+
+
+def drawn_beside(beside: Beside[Asked, Answer], shown: xr.DataTree) -> None:
+    """Have the process draw figures once it has the answer, until they are wanted.
+
+    Parameters
+    ----------
+    beside : Beside
+    shown : DataTree
+        Of the search alone. What cannot be sent is drawn here, later.
+    """
+    with suppress(Exception):
+        beside.go_on_with(draw_ahead, shared_by(shown), parts_ahead(shown))
 
 
 class Early[K]:
