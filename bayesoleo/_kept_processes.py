@@ -211,10 +211,15 @@ def load(modules: Sequence[str]) -> None:
             importlib.import_module(name)
     finally:
         gc.freeze()
-        if 0 < gc.get_threshold()[0] < SELDOM[0]:  # at 0 there are none
-            gc.set_threshold(*SELDOM)
+        search_seldom()
         if was_on:
             gc.enable()
+
+
+def search_seldom() -> None:
+    """Search for garbage less often than Python does, where it does at all."""
+    if 0 < gc.get_threshold()[0] < SELDOM[0]:
+        gc.set_threshold(*SELDOM)
 
 
 def serve(modules: Sequence[str]) -> None:
@@ -229,6 +234,7 @@ def serve(modules: Sequence[str]) -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     parallel.limit_threads(1)
+    search_seldom()
     source, target = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what is printed must not get among the messages
     load(modules)

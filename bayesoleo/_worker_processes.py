@@ -37,8 +37,8 @@ from bayesoleo._process_messages import Message, as_it_is, dumps, loads
 #: Seconds of work left, as far as can be seen, from which processes that run already are asked,
 #: and from which one is started.
 WORTH_ASKING, WORTH_STARTING = 0.5, 4.0
-#: Items that are left while a process has one in hand beside that which it does: with fewer,
-#: another one may be through before it begins with that.
+#: Items for each process that are left while one has another in hand beside that which it does:
+#: with fewer, others may be through before it begins with that.
 LEFT_TO_OTHERS = 4
 #: Seconds between looks at whether they are worth asking.
 LOOK = 0.05
@@ -113,6 +113,7 @@ def _shared[S, T, R](
         threading.Thread(target=call.help, args=(k,), daemon=True)
         for k in range(min(jobs, len(work)) - 1)
     ]
+    call.spared = LEFT_TO_OTHERS * len(helpers)
     for helper in helpers:
         helper.start()
     try:
@@ -161,10 +162,11 @@ class _Call:
     ):
         self.function, self.shared, self.items, self.known = function, shared, items, known
         self.left = deque(order)
+        self.spared = LEFT_TO_OTHERS
         self.found: dict[int, Any] = {}
         self.failed: BaseException | None = None
         self.lock, self.over = threading.Lock(), threading.Event()
-        self.begun = time.perf_counter()
+        self.begun, self.stopped = time.perf_counter(), False
         self._sent: Message = []
 
     def _take(self, last: bool, leaving: int = 0) -> int | None:
@@ -175,7 +177,8 @@ class _Call:
 
     def _give_back(self, index: int) -> None:
         with self.lock:
-            self.left.appendleft(index)
+            if not self.stopped:  # else nobody wants it any more
+                self.left.appendleft(index)
 
     def work(self) -> None:
         """Do items here until none is left and those of other processes have come."""
@@ -192,6 +195,7 @@ class _Call:
     def stop(self) -> None:
         """Take no further items."""
         with self.lock:
+            self.stopped = True
             self.left.clear()
 
     def results(self) -> list[Any]:
@@ -204,7 +208,8 @@ class _Call:
         """Have another process do items, from the last on, once that is worth it.
 
         What it does next is taken and made a message of while it works, and sent before its answer
-        is read: this process has other things to do, and a waiting one has not.
+        is read: this process has other things to do, and a waiting one has not. No call may change
+        an item of another one.
         """
         while not self._worth(number):
             if not self.left:
@@ -219,9 +224,11 @@ class _Call:
             if (now := self._take(last=True)) is not None:
                 worker.send(sent((now, self.items[now]), objects))
             while now is not None:
-                then = self._take(last=True, leaving=LEFT_TO_OTHERS)
+                then = self._take(last=True, leaving=self.spared)
                 following = None if then is None else sent((then, self.items[then]), objects)
                 answer = worker.answer()
+                if self.failed is not None:
+                    break  # nobody waits for what it would do next
                 if following is None and (then := self._take(last=True)) is not None:
                     following = sent((then, self.items[then]), objects)
                 if following is not None:
@@ -229,7 +236,7 @@ class _Call:
                 kind, value = content_of(answer, objects)
                 if kind == ERROR:
                     self.failed = value
-                    if then is not None:  # nobody waits for what it does
+                    if then is not None:  # nor for what it does now
                         raise LostError
                 else:
                     self.found[now] = value
@@ -444,7 +451,9 @@ class Beside[S, R]:
             If they cannot be sent.
         """
         more = [(function, shared, None), *((0, item) for item in items)]
-        self._more[:] = [as_it_is(sent(one)) for one in more]
+        messages = [as_it_is(sent(one)) for one in more]
+        if not self.answered:
+            self._more[:] = messages
 
     @classmethod
     def may_begin(cls, jobs: int | None = None) -> bool:

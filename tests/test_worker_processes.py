@@ -178,6 +178,35 @@ def test_an_error_does_not_wait_for_what_a_process_has_in_hand(eager):
     assert len(process_map(slow_square, {"unit": 1.0}, range(4), 2)) == 4
 
 
+def fails_beside_others(parent, item):
+    """Another process than the one that fails has long items, this one short ones."""
+    if os.getpid() != parent and item == 29:
+        time.sleep(1.0)  # until the other one has its next in hand
+        raise ValueError("item 29")
+    time.sleep(0.3 if os.getpid() == parent else 6.0)
+    return item
+
+
+def test_an_error_does_not_wait_for_what_others_have_in_hand(eager):
+    for number in (0, 1):
+        kept_processes.process_of(number).ask(messages.dumps((None, None, None)))
+    began = time.monotonic()
+    with pytest.raises(ValueError, match="item 29"):
+        process_map(fails_beside_others, os.getpid(), range(30), 3)
+    assert time.monotonic() - began < 10.0  # two items of the other one take twelve
+    kept_processes.forget(1)
+
+
+def test_what_nobody_waits_for_is_not_given_to_another_process():
+    call = processes._Call(slow_square, {"unit": 1.0}, list(range(3)), lambda _: (), range(3))
+    index = call._take(last=True)
+    call._give_back(index)
+    assert call._take(last=False) == index
+    call.stop()
+    call._give_back(index)
+    assert not call.left
+
+
 def test_a_process_has_its_next_item_before_its_answer_is_read(eager, monkeypatch):
     """None of the last few: another process may be through before it begins with one."""
     events, rightly = [], processes.content_of
@@ -435,6 +464,7 @@ def test_other_work_may_be_named_once_the_call_goes_on(eager):
     beside = processes.Beside.begun(where_and_twice, 4, 2)
     beside._thread.join()
     beside.go_on_with(shifted, 100, [1, 2])
+    assert not beside._more
     assert beside.result()[1] == 8
     assert beside.taken() == {}
     # What cannot be sent is told, and takes nothing from the call.

@@ -158,9 +158,10 @@ def close(
         beside = begun_beside(_asked_of(task, loop), settings.jobs)
         if beside is None:
             return None, None
-        known, shown = _shown_early(task, loop, output)
-        if shown is not None:
-            drawn_beside(beside, shown)
+        with beside:  # an interrupt ends the process: nobody else knows of it yet
+            known, shown = _shown_early(task, loop, output)
+            if shown is not None:
+                drawn_beside(beside, shown)
         return known, beside
 
     with output.alone(), Early(begin, settings.jobs) as early:

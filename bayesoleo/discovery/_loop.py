@@ -12,6 +12,7 @@ evidence that a cause was found.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -31,7 +32,12 @@ from bayesoleo.discovery._judged_together import TOGETHER, judged_together
 from bayesoleo.discovery._nonparametric_round import nonparametric_notes, with_nonparametric
 from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._policy import SearchPolicy
-from bayesoleo.discovery._ranking import ABSORBING_FAMILIES, Ranked, prepare_options
+from bayesoleo.discovery._ranking import (
+    ABSORBING_FAMILIES,
+    Ranked,
+    forget_options,
+    prepare_options,
+)
 from bayesoleo.discovery._review import reviewed
 from bayesoleo.discovery._round import JUDGED, Progress, Round, examine
 from bayesoleo.discovery._scanned_columns import Scanned
@@ -649,6 +655,7 @@ def _begun(
         callback("the residual exceeds the expected error: try other starts")
         start = better_start(state.fit, numerics, partial(_prepare, state, effects))
         if start is not None:
+            forget_options()
             before = state.fit.point.objective
             state = fit_state(assembly, roles, numerics, start=start, progress=callback)
             notes.append(
@@ -659,8 +666,9 @@ def _begun(
 
 
 def _prepare(state: State, effects: Sequence[Effect] | None) -> None:
-    """Look for the candidates of the first round; that has no need of a second core."""
-    if not state.unsolved:
+    """Look for the candidates of the first round, while another process tries other starts. What
+    fails is met again in that round, if the state is still the one it is about."""
+    with suppress(Exception):
         prepare_options(state.base(), state.assembly, effects)
 
 

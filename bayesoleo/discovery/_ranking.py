@@ -311,6 +311,11 @@ def prepare_options(base: Base, assembly: Assembly, effects: Sequence[Effect] | 
     _prepared[:] = [(weakref.ref(base), assembly, effects, options)]
 
 
+def forget_options() -> None:
+    """Free what was prepared for a model that is no longer the present one."""
+    _prepared.clear()
+
+
 def _options_of(base: Base, assembly: Assembly, effects: Sequence[Effect] | None) -> list[Option]:
     """Every effect at every place; those that were prepared are given away once."""
     known, _prepared[:] = list(_prepared), []

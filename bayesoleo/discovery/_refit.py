@@ -242,7 +242,10 @@ def refit(base: Base, score: Score, numerics: Numerics) -> Refit:
     assembly = assembly.with_parameters(new_parameters(assembly, score, base.policy))
     model = assembly.model()
     fit = quick_fit(base, model, _starts(base, score, model), numerics)
-    return refit_at(base, score, assembly, fit)
+    found = refit_at(base, score, assembly, fit)
+    # Its predictions are kept; those of the estimator are the same, and as large.
+    fit.problem.forget()
+    return found
 
 
 def refit_at(base: Base, score: Score, assembly: Assembly, fit: ModelFit) -> Refit:
@@ -272,8 +275,6 @@ def refit_at(base: Base, score: Score, assembly: Assembly, fit: ModelFit) -> Ref
     fall = share * base.fall_back
     reached = base.excess - fall < base.feigned
     price = schwarz_price(base)
-    # Its predictions are kept; those of the estimator are the same, and as large.
-    fit.problem.forget()
     return Refit(
         score, grown, fit, share, contribution, remaining, noise, fall, reached, price,
         base.policy, base.feigned,

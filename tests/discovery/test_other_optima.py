@@ -14,9 +14,9 @@ from small_campaigns import MASS, oscillator_campaign
 import bayesoleo._worker_processes as processes
 from bayesoleo.discovery import _ranking
 from bayesoleo.discovery._assembly import Assembly, assign
-from bayesoleo.discovery._loop import OTHER_OPTIMUM, close_loop
+from bayesoleo.discovery._loop import OTHER_OPTIMUM, _begun, close_loop
 from bayesoleo.discovery._ranking import prepare_options
-from bayesoleo.discovery._state import better_start, fit_state
+from bayesoleo.discovery._state import State, better_start, fit_state
 from bayesoleo.effects import find_effect
 from bayesoleo.model import Model, Output, Parameter
 
@@ -83,6 +83,19 @@ def test_candidates_that_were_prepared_are_those_that_are_scored(beyond):
     prepare_options(base, assembly, effects)
     found = _ranking._options_of(base, assembly, other)
     assert {option.candidate.effect for option in found} == {"cubic_stiffness"}
+    assert not _ranking._prepared
+
+
+def test_a_wrong_optimum_whose_candidates_cannot_be_looked_for_is_left(beyond, monkeypatch):
+    """What goes wrong there is met again only where no other start is better."""
+
+    def broken(state):
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr(State, "base", broken)
+    roles = assign(beyond.fit.records)
+    found = _begun(Assembly(oscillator(17.0)), roles, NUMERICS, beyond.fit, None, lambda _: None)
+    assert found.state.fit.shared["stiffness"] == pytest.approx(STIFFNESS, rel=1e-2)
     assert not _ranking._prepared
 
 

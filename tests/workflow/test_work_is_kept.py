@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import signal
@@ -16,6 +17,7 @@ import pytest
 from small_campaigns import damper, damper_campaign
 from typer.testing import CliRunner
 
+import bayesoleo._worker_processes as processes
 from bayesoleo import _schema as schema, _workflow as workflow
 from bayesoleo._cli import app
 from bayesoleo._cli.shell import UNFINISHED
@@ -200,6 +202,19 @@ def test_what_is_shown_early_may_fail(campaign, tmp_path, monkeypatch):
     summary, page = read_back(tmp_path)
     assert summary["unfinished"] == []
     assert "<figure>" in page
+
+
+def test_an_interrupt_while_that_is_made_leaves_the_processes_free(campaign, tmp_path, monkeypatch):
+    monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
+    monkeypatch.setattr(closing, "WORTH_KEEPING", math.inf)  # however slow the machine is
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(closing, "finish", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        workflow.close(campaign, damper(), replace(SETTINGS, jobs=2), out=tmp_path)
+    assert not processes._in_use.locked()
 
 
 @pytest.mark.slow
