@@ -442,10 +442,10 @@ def test_another_process_judges_runs_alike(monkeypatch):
     monkeypatch.setattr(processes, "WORTH_ASKING", 0.0)
     records = [free_decay("a", 0.1), free_decay("bb", 0.2)]
     state = fit_state(Assembly(decay_model()), _roles_of(records[:1]), NUMERICS)
-    ask, asked, told = kept_processes.Worker.ask, [], []
+    read, asked, told = processes.content_of, [], []
 
-    def counted(worker, message, known=()):
-        found = ask(worker, message, known)
+    def counted(answer, known=()):
+        found = read(answer, known)
         asked.append(found[0])
         return found
 
@@ -455,7 +455,7 @@ def test_another_process_judges_runs_alike(monkeypatch):
 
     predictive_distribution = _next_experiment.predictive_distribution
     monkeypatch.setattr(_next_experiment, "predictive_distribution", slowly)
-    monkeypatch.setattr(kept_processes.Worker, "ask", counted)
+    monkeypatch.setattr(processes, "content_of", counted)
     try:
         worker = kept_processes.process_of(0, processes.OF_A_SEARCH)
         worker.ask(messages.dumps((None, None, None)))  # it answers once it has begun
