@@ -28,9 +28,10 @@ ENDING = 5.0
 #: Where optional libraries are missing, this one looks for its callers in all modules that are
 #: loaded: the later it comes, the longer that takes.
 EARLY = "arviz_base"
-#: New objects, searches of them and larger ones between which a process of this package's own looks
-#: for garbage. Expressions and records live on in hundred thousands, and little of them is garbage:
-#: at Python's 2000, 10 and 10 the searches take four hundredths of a command's time.
+#: Thresholds of the search for garbage in a process of this package's own: new objects before a
+#: search of these, and searches before one of older objects and before one of all. Expressions and
+#: records live on in hundred thousands, and little of them is garbage: at Python's 2000, 10 and 10
+#: the searches take four hundredths of a command's time.
 SELDOM = 200_000, 10, 10
 #: It finds modules where its parent finds them, and does not run the user's script again.
 _CHILD = (

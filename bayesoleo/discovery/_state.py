@@ -71,13 +71,13 @@ def better_start(
     """
     best, height = None, fit.point.objective + numerics.policy.better_optimum_declared
     starts = promising(fit.problem, fit.point.theta, numerics.policy)
-    for point in process_map(_from, (fit, numerics), starts, numerics.jobs, before=before):
+    for point in process_map(_from_start, (fit, numerics), starts, numerics.jobs, before=before):
         if point.status.ok and point.objective > height:
             best, height = point.theta, point.objective
     return best
 
 
-def _from(shared: tuple[ModelFit, Numerics], start: Array) -> PointEstimate:
+def _from_start(shared: tuple[ModelFit, Numerics], start: Array) -> PointEstimate:
     """The estimate from another start, also in another process."""
     fit, numerics = shared
     return fit_model(
