@@ -108,12 +108,9 @@ def _shared[S, T, R](
     order: Sequence[int],
 ) -> list[R]:
     """Results of :func:`process_map` by this process and others."""
-    call = _Call(function, shared, work, known, order)
-    helpers = [
-        threading.Thread(target=call.help, args=(k,), daemon=True)
-        for k in range(min(jobs, len(work)) - 1)
-    ]
-    call.spared = LEFT_TO_OTHERS * len(helpers)
+    others = min(jobs, len(work)) - 1
+    call = _Call(function, shared, work, known, order, others)
+    helpers = [threading.Thread(target=call.help, args=(k,), daemon=True) for k in range(others)]
     for helper in helpers:
         helper.start()
     try:
@@ -159,10 +156,11 @@ class _Call:
         items: list[Any],
         known: Callable[[Any], Sequence[Any]],
         order: Sequence[int],
+        others: int,
     ):
         self.function, self.shared, self.items, self.known = function, shared, items, known
         self.left = deque(order)
-        self.spared = LEFT_TO_OTHERS
+        self.spared = LEFT_TO_OTHERS * others
         self.found: dict[int, Any] = {}
         self.failed: BaseException | None = None
         self.lock, self.over = threading.Lock(), threading.Event()

@@ -198,7 +198,7 @@ def test_an_error_does_not_wait_for_what_others_have_in_hand(eager):
 
 
 def test_what_nobody_waits_for_is_not_given_to_another_process():
-    call = processes._Call(slow_square, {"unit": 1.0}, list(range(3)), lambda _: (), range(3))
+    call = processes._Call(slow_square, {"unit": 1.0}, list(range(3)), lambda _: (), range(3), 1)
     index = call._take(last=True)
     call._give_back(index)
     assert call._take(last=False) == index

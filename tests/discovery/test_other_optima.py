@@ -60,7 +60,14 @@ def test_the_better_start_does_not_depend_on_processes(beyond, monkeypatch):
     monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
     monkeypatch.setattr(processes, "WORTH_STARTING", 0.0)
     monkeypatch.setattr(processes, "WORTH_ASKING", 0.0)
-    asked = []
+    asked, kinds, read = [], [], processes.content_of
+
+    def noted(*given):
+        found = read(*given)
+        kinds.append(found[0])
+        return found
+
+    monkeypatch.setattr(processes, "content_of", noted)
 
     def before():  # the other process has all starts but one meanwhile
         asked.append(beyond)
@@ -69,6 +76,7 @@ def test_the_better_start_does_not_depend_on_processes(beyond, monkeypatch):
     two = better_start(beyond.fit, replace(NUMERICS, jobs=2), before)
     np.testing.assert_array_equal(two, alone)
     assert asked == [beyond]
+    assert processes.VALUE in kinds  # of another process
 
 
 def test_candidates_that_were_prepared_are_those_that_are_scored(beyond):
