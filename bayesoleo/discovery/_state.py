@@ -29,7 +29,7 @@ from bayesoleo.discovery._expected_error import (
     expected_of_held_out,
 )
 from bayesoleo.discovery._fewest_steps import for_comparison
-from bayesoleo.discovery._fit import ModelFit, fit_model
+from bayesoleo.discovery._fit import COMPARED, ModelFit, fit_model
 from bayesoleo.discovery._fit_and_hold_out_error import (
     ErrorTable,
     Noise,
@@ -78,7 +78,7 @@ def better_start(
 
 
 def _from_start(shared: tuple[ModelFit, Numerics], start: Array) -> PointEstimate:
-    """The estimate from another start, also in another process."""
+    """The estimate from another start, also in another process; a better one is estimated anew."""
     fit, numerics = shared
     return fit_model(
         fit.model,
@@ -87,6 +87,7 @@ def _from_start(shared: tuple[ModelFit, Numerics], start: Array) -> PointEstimat
         start=start,
         tolerance=1e-4,
         max_iterations=30,
+        resolution=COMPARED,
         share=fit.predictor,
         check_mesh=False,
     ).point

@@ -223,6 +223,13 @@ class CampaignProblem:
         left = np.subtract(self.predictor.runs[run].measured, samples.y, out=samples.y)
         return self.kept(run, left), samples.status
 
+    def outputs_at(self, theta: Array, run: int, chosen: Integers) -> Array:
+        """Outputs (L, s, m) of one run at vectors (L, l), from the anchor, at some of the samples
+        that count, by their numbers (m,)."""
+        kept = self.predictor.records[run].kept
+        numbers = chosen if kept is None else np.flatnonzero(kept)[chosen]
+        return self.predictor.simulate_at(self.full(theta), run, numbers).y
+
     def freeze(self, theta: Array) -> Status:
         """Fix the anchor that :meth:`misfit` starts from: it then depends on the vector alone."""
         return max(self.predictor.set_anchor(self.full(theta[None])[0]), default=Status.CONVERGED)

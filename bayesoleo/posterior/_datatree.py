@@ -34,6 +34,7 @@ from bayesoleo import _schema as schema
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array, Integers
 from bayesoleo.error_models._base import RunSamples
+from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._problem import ResidualProblem
 from bayesoleo.model._correlated_priors import sample_of
 from bayesoleo.model._priors import Prior
@@ -254,21 +255,33 @@ def _at_draws(
     likelihood, expected = np.empty(shape), np.empty(shape)
 
     def work(rows: slice) -> None:
-        residuals = [problem.residuals(theta[rows], run)[0] for run in range(len(blocks))]
-        moved, of_density = density.errors.moved(theta[rows]), residuals
-        if not np.array_equal(moved, theta[rows]):
-            of_density = [problem.residuals(moved, run)[0] for run in range(len(blocks))]
-        found = density.errors.of_blocks(of_density, eta[rows], [part.starts for part in blocks])
+        moved = density.errors.moved(theta[rows])
+        residuals = [problem.residuals(moved, run)[0] for run in range(len(blocks))]
+        found = density.errors.of_blocks(residuals, eta[rows], [part.starts for part in blocks])
         likelihood[rows] = np.concatenate(found, axis=2)
+        same = np.array_equal(moved, theta[rows])
         for run, (e, part) in enumerate(zip(residuals, blocks, strict=True)):
             columns = slice(ends[run], ends[run + 1])
-            expected[rows, :, columns] = measured[run][:, part.shown] - e[:, :, part.shown]
+            if same:
+                shown = measured[run][:, part.shown] - e[:, :, part.shown]
+            else:
+                shown = _predicted(problem, theta[rows], run, part.shown, measured[run])
+            expected[rows, :, columns] = shown
 
     # What is called for each block of draws takes as long as some draws; all runs are kept of it.
     few = max(LANES, min(MOST_LANES, MOST_VALUES // sum(part.size for part in measured)))
     parts = [slice(k, min(k + few, len(natural))) for k in range(0, len(natural), few)]
     thread_map(work, parts, density.jobs)
     return likelihood, expected
+
+
+def _predicted(
+    problem: ResidualProblem, theta: Array, run: int, shown: Integers, measured: Array
+) -> Array:
+    """Outputs (L, s, m) of a run at some samples; a campaign's are not computed at all others."""
+    if isinstance(problem, CampaignProblem):
+        return problem.outputs_at(theta, run, shown)
+    return np.asarray(measured[:, shown] - problem.residuals(theta, run)[0][:, :, shown])
 
 
 def common_to_runs(density: LogDensity, natural: Array, rng: np.random.Generator) -> Array | None:

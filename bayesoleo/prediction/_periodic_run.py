@@ -406,6 +406,19 @@ class RunPredictor:
         jumped = self._left(p, solution.x, samples.status, monodromy)
         return replace(samples, jumped=jumped, monodromy=monodromy)
 
+    def predict_at(self, p: Array, chosen: Integers) -> PredictedSamples:
+        """The same at some of the samples alone, ``chosen (m,)`` by their numbers: where these are
+        few, only the solutions take time."""
+        if type(self) is not RunPredictor or not self.kernels.derived.dofs:
+            every = self.predict(p)
+            return replace(every, y=every.y[..., chosen])
+        solution = self.solve(p)
+        plan, step = self._at(self.record.phase[chosen]), self.boundary.step(self.steps)
+        z = self.scheme.sample(solution.x[..., None], plan, step)[:, :, 0]
+        inputs = np.ascontiguousarray(self.sample_inputs[:, chosen])
+        y, status = self._only_outputs(p, z, inputs, solution.status)
+        return PredictedSamples(y, None, status, self._left(p, solution.x, status))
+
     def sample_rest(self, p: Array) -> PredictedSamples:
         """Equations at rest, and outputs as if rest solved them, with derivatives, at constants
         ``p (1, np)``: what that needs is compiled then."""
@@ -608,15 +621,12 @@ class RunPredictor:
     ) -> PredictedSamples:
         """Outputs of rows ``z (L, nz, N)`` at the samples, and derivatives, with those of the rows
         by the parameters that move them, and which these are."""
-        derived, count = self.kernels.derived, p.shape[0]
-        samples, ny, na = self.record.time.size, len(derived.outputs), len(derived.active)
         lanes = np.flatnonzero(status == Status.CONVERGED.value)
-        y = np.full((count, ny, samples), np.nan)
-        with np.errstate(all="ignore"):
-            self.kernels.output(z, self.sample_inputs, p, lanes, y)
-        status = self._judge(status, z, p, y, lanes)
+        y, status = self._only_outputs(p, z, self.sample_inputs, status)
         if not derivatives:
             return PredictedSamples(y, None, status)
+        count, ny, samples = y.shape
+        na = len(self.kernels.derived.active)
         yz, yp = np.zeros((count, ny, z.shape[1], samples)), np.zeros((count, ny, na, samples))
         with np.errstate(all="ignore"):
             self.kernels.output_jacobian(z, self.sample_inputs, p, lanes, yz, yp)
@@ -628,6 +638,17 @@ class RunPredictor:
             else:
                 yp[:, :, moves] += through
         return PredictedSamples(y, yp, status)
+
+    def _only_outputs(
+        self, p: Array, z: Array, inputs: Array, status: Integers
+    ) -> tuple[Array, Integers]:
+        """Outputs ``(L, ny, N)`` of rows ``z (L, nz, N)`` and ``inputs (nu, N)``, and statuses with
+        those of lanes whose outputs are not finite or leave the admissible region."""
+        lanes = np.flatnonzero(status == Status.CONVERGED.value)
+        y = np.full((p.shape[0], len(self.kernels.derived.outputs), inputs.shape[1]), np.nan)
+        with np.errstate(all="ignore"):
+            self.kernels.output(z, inputs, p, lanes, y)
+        return y, self._judge(status, z, inputs, p, y, lanes)
 
     def squares(self, p: Array) -> tuple[Array, Integers]:
         """Sums of squared residuals, shape (L, ny), and statuses, for constants ``p (L, np)``; sums
@@ -673,14 +694,16 @@ class RunPredictor:
             return np.empty((p.shape[0], 0, 1, self.record.time.size))
         return self.scheme.sample(x, self.plan, self.boundary.step(self.steps))
 
-    def _judge(self, status: Integers, z: Array, p: Array, y: Array, lanes: Integers) -> Integers:
+    def _judge(
+        self, status: Integers, z: Array, inputs: Array, p: Array, y: Array, lanes: Integers
+    ) -> Integers:
         """Mark lanes whose outputs are not finite or whose samples leave the admissible region."""
         finite = np.isfinite(y[lanes]).all(axis=(1, 2))
         inside = np.ones(lanes.size, dtype=np.bool_)
         if self.boundary.conditions:
             a = np.ones((p.shape[0], self.boundary.conditions, y.shape[2]))
             with np.errstate(all="ignore"):
-                self.kernels.admissible(z, self.sample_inputs, p, lanes, a)
+                self.kernels.admissible(z, inputs, p, lanes, a)
             finite &= ~np.isnan(a[lanes]).any(axis=(1, 2))
             inside = ~(a[lanes] <= 0).any(axis=(1, 2))
         status = _failing(status, lanes, finite, inside)

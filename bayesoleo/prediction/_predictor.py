@@ -344,6 +344,15 @@ class Predictor:
         """Outputs of run number ``r`` for many vectors, shape (L, l)."""
         return self.runs[r].predict(self.constants(theta, r))
 
+    def simulate_at(
+        self,
+        theta: Float[Array, "vectors unknowns"],
+        r: int,
+        chosen: Int[Integers, " samples"],
+    ) -> PredictedSamples:
+        """The same at some samples of the run alone, given by their numbers."""
+        return self.runs[r].predict_at(self.constants(theta, r), chosen)
+
     def sum_of_squares(
         self, theta: Float[Array, "vectors unknowns"]
     ) -> tuple[Float[Array, "vectors runs outputs"], Int[Integers, " vectors"]]:

@@ -10,7 +10,7 @@ from bayesoleo.error_models._stretch import Stretch
 from bayesoleo.errors import InputError
 from bayesoleo.model._priors import LogNormal, Transforms
 from bayesoleo.posterior import LogDensity, laplace_mixture, sample
-from bayesoleo.posterior._datatree import block_groups
+from bayesoleo.posterior._datatree import _at_draws, _measured, block_groups, cut
 from bayesoleo.posterior._laplace import find_mode, start_coordinates
 
 ESTIMATE = np.array([0.5, 1.5])
@@ -90,6 +90,20 @@ def test_blocks_have_the_density_that_was_sampled():
     shown = groups["posterior_predictive"]["force"].values
     assert level == pytest.approx(3.0 * 0.2 / np.sqrt(400), rel=0.2)
     assert abs(shown.mean() - theta[0]) < 3.0
+
+
+def test_what_is_predicted_is_that_of_the_draw_and_not_of_the_place_of_its_density():
+    problem, theta, _ = stretched(line(), (3.0, 1.0))
+    density = LogDensity(problem, errors="spectral")
+    natural = np.column_stack([np.tile(theta, (4, 1)), np.full(4, 0.04)])
+    natural[:, 0] += [0.1, -0.1, 0.2, 0.0]
+    blocks, measured = cut(density), _measured(problem)
+    _, expected = _at_draws(natural, density, blocks, measured)
+    first = blocks[0].shown
+    own = measured[0][:, first] - problem.residuals(natural[:, :2], 0)[0][:, :, first]
+    np.testing.assert_allclose(expected[:, :, : len(first)], own, rtol=1e-12)
+    moved = density.errors.moved(natural[:, :2])
+    assert np.abs(moved - natural[:, :2])[:3].max(axis=1).min() > 0.05
 
 
 def test_without_a_covariance_it_says_what_to_take_instead():

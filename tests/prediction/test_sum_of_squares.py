@@ -2,11 +2,13 @@
 
 import copy
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from synthetic_runs import answered, harmonics, oleo_runs, run, stroke
 
+from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.model import Model, Output, Parameter
 from bayesoleo.model._drive_and_start import driven_by
 from bayesoleo.prediction._predictor import Predictor
@@ -95,6 +97,30 @@ def test_sums_are_those_of_the_predicted_outputs(predictor, vectors, whole):
         expected = np.sum((one.measured - samples.y) ** 2, axis=2)
         # The same numbers summed in another order.
         np.testing.assert_allclose(whole[0][:4, r], expected, rtol=1e-12)
+
+
+def test_outputs_at_some_samples_are_those_among_all_of_them(predictor, vectors):
+    for r, one in enumerate(predictor.runs):
+        chosen = np.array([0, 3, one.record.time.size - 1, 7])
+        every, few = predictor.simulate(vectors, r), predictor.simulate_at(vectors, r, chosen)
+        # The same formulas by another function of the compiler.
+        np.testing.assert_allclose(few.y[:5], every.y[:5, :, chosen], rtol=1e-14)
+        np.testing.assert_allclose(few.y[11:], every.y[11:, :, chosen], rtol=1e-14)
+        # Where the piston would leave the gas no volume may be at another sample.
+        np.testing.assert_array_equal(np.delete(few.status, 5), np.delete(every.status, 5))
+        np.testing.assert_array_equal(few.jumped[:5], every.jumped[:5])
+
+
+def test_chosen_samples_are_those_that_count(model):
+    record = answered(model, oleo_runs()[:1], noise=0.01, steps=STEPS)[0]
+    kept = np.arange(record.time.size) % 3 > 0
+    problem = CampaignProblem(Predictor(model, [replace(record, kept=kept)], steps=STEPS))
+    problem.freeze(problem.start)
+    chosen, theta = np.array([1, 4, 10]), problem.start[None]
+    measured = problem.kept(0, problem.predictor.runs[0].measured)
+    expected = measured[:, chosen] - problem.residuals(theta, 0)[0][..., chosen]
+    # A difference from measured values loses a digit.
+    np.testing.assert_allclose(problem.outputs_at(theta, 0, chosen), expected, rtol=1e-12)
 
 
 def test_back_ends_agree_to_round_off(model):
