@@ -408,7 +408,8 @@ class RunPredictor:
 
     def predict_at(self, p: Array, chosen: Integers) -> PredictedSamples:
         """The same at some of the samples alone, ``chosen (m,)`` by their numbers: where these are
-        few, only the solutions take time."""
+        few, only the solutions take time. Whether outputs are finite and inside the admissible
+        region is judged at these samples."""
         if type(self) is not RunPredictor or not self.kernels.derived.dofs:
             every = self.predict(p)
             return replace(every, y=every.y[..., chosen])

@@ -12,7 +12,7 @@ from fitted_states import NUMERICS
 from small_campaigns import MASS, oscillator_campaign
 
 import bayesoleo._worker_processes as processes
-from bayesoleo.discovery import _ranking
+from bayesoleo.discovery import _loop, _ranking
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._loop import OTHER_OPTIMUM, _begun, close_loop
 from bayesoleo.discovery._ranking import prepare_options
@@ -69,14 +69,27 @@ def test_the_better_start_does_not_depend_on_processes(beyond, monkeypatch):
 
     monkeypatch.setattr(processes, "content_of", noted)
 
-    def before():  # the other process has all starts but one meanwhile
+    def before():  # the other process has all starts but one meanwhile, once it has its libraries
         asked.append(beyond)
-        time.sleep(3.0)
+        deadline = time.monotonic() + 60.0
+        while not kinds and time.monotonic() < deadline:
+            time.sleep(0.05)
 
     two = better_start(beyond.fit, replace(NUMERICS, jobs=2), before)
     np.testing.assert_array_equal(two, alone)
     assert asked == [beyond]
     assert processes.VALUE in kinds  # of another process
+
+
+def test_a_start_that_ends_in_a_worse_optimum_is_not_taken(beyond, monkeypatch):
+    roles, theta = assign(beyond.fit.records), beyond.fit.point.theta
+    better = better_start(beyond.fit, replace(NUMERICS, jobs=1))
+    right = fit_state(beyond.assembly, roles, NUMERICS, start=better).fit
+    monkeypatch.setattr(State, "at_floor", False)
+    monkeypatch.setattr(_loop, "better_start", lambda *_: theta)
+    found = _begun(beyond.assembly, roles, NUMERICS, right, None, lambda _: None)
+    assert found.state.fit is right
+    assert not any(note.startswith(OTHER_OPTIMUM) for note in found.notes)
 
 
 def test_candidates_that_were_prepared_are_those_that_are_scored(beyond):
