@@ -207,7 +207,19 @@ def test_what_nobody_waits_for_is_not_given_to_another_process():
     assert not call.left
 
 
-def test_a_process_has_its_next_item_before_its_answer_is_read(eager, monkeypatch):
+def square_behind_another(shared, item):
+    """This process waits for three items of the other one, which a busy machine may hold up."""
+    parent, folder = shared
+    if os.getpid() != parent:
+        (folder / str(item)).touch()
+    for _ in range(1200 if os.getpid() == parent else 0):
+        if len(list(folder.iterdir())) > 2:
+            break
+        time.sleep(0.05)
+    return item**2
+
+
+def test_a_process_has_its_next_item_before_its_answer_is_read(eager, monkeypatch, tmp_path):
     """None of the last few: another process may be through before it begins with one."""
     events, rightly = [], processes.content_of
     send, answer = kept_processes.Worker.send, kept_processes.Worker.answer
@@ -223,8 +235,8 @@ def test_a_process_has_its_next_item_before_its_answer_is_read(eager, monkeypatc
     monkeypatch.setattr(kept_processes.Worker, "answer", noted("answer", answer))
     monkeypatch.setattr(processes, "content_of", noted("read", rightly))
     count = 3 * processes.LEFT_TO_OTHERS
-    found = process_map(slow_square, {"unit": 1.0}, range(count), 2)
-    assert [value for _, value in found] == [float(k**2) for k in range(count)]
+    found = process_map(square_behind_another, (os.getpid(), tmp_path), range(count), 2)
+    assert found == [k**2 for k in range(count)]
     # First it is told what to do, and at last that there is no more.
     items = events[events.index("send", 1) : -2]
     assert items[:4] == ["send", "answer", "send", "read"]
