@@ -315,7 +315,7 @@ def write_report(
     before : callable
         What this process does before it draws, while another one draws.
     ahead : callable, optional
-        Asked before that for the figures that exist, as :func:`draw_ahead` drew them.
+        Asked after that for the figures that exist, as :func:`draw_ahead` drew them.
 
     Returns
     -------

@@ -35,13 +35,16 @@ def figures_of(
     ahead: Callable[[], Pictures] | None,
 ) -> dict[str, list[Any]]:
     """All that is drawn, by its place on the page; in several processes."""
-    # No more is drawn ahead now: what takes longest is left, and the other process begins with it.
-    known = {} if ahead is None else dict(ahead())
+    known = dict[Part, list[Any]]()
+    if ahead is not None:
+        before()  # the other process goes on drawing meanwhile
+        known = dict(ahead())
     makers = _makers(summary)
     every = _parts(tree, makers, drawing)
     left = [part for part in every if part not in known]
     items = [(*makers[kind], number) for kind, number in left]
-    found = process_map(_draw, shared_by(tree), items, before=before)
+    first = before if ahead is None else lambda: None
+    found = process_map(_draw, shared_by(tree), items, before=first)
     said = [*drawing.failed, *(text for _, failed in found for text in failed)]
     drawing.failed = list(dict.fromkeys(said))  # what fails of several figures, once
     known |= {part: drawn for part, (drawn, _) in zip(left, found, strict=True)}
