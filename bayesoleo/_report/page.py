@@ -408,7 +408,7 @@ def _content(
         "lead": figures["structures"] or figures["error"],
         "runs": sentences.runs_used(summary),
         "errors_word": sentences.error_model(_posterior_attributes(tree), summary),
-        "viewer": sections.viewer(tree),
+        "viewer": next(iter(figures["viewer"]), None),
         "periodic": [run.periodic for run in reading.runs(tree)],
         "residual_title": sections.residual_title(tree),
         "number": itertools.count(1),

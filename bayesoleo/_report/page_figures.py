@@ -100,7 +100,7 @@ def _makers(summary: dict[str, Any]) -> dict[str, tuple[str, Maker]]:
 
     Processes take them from both ends, so that what takes longest stands there.
     """
-    first, last = ("residual", "fit", "where"), ("formulas", "response", "data")
+    first, last = ("residual", "fit", "where"), ("viewer", "formulas", "response", "data")
     makers: dict[str, tuple[str, Maker]] = {name: WITHOUT_DRAWS[name] for name in first} | {
         "structures": ("the probabilities of structures", sections.structures_figure),
         "error": ("the error of each run", sections.error_figure),
@@ -155,6 +155,11 @@ def _formula(text: str) -> dict[str, Any]:
     return {"latex": text, "image": encode_formula(text)}
 
 
+def _viewer(tree: xr.DataTree) -> list[Callable[[], dict[str, Any] | None]]:
+    """What the page's script draws, which takes as long as a figure."""
+    return [partial(sections.viewer, tree)]
+
+
 #: What is drawn, in words, and the function that draws it, of the data and of the search alone.
 WITHOUT_DRAWS: dict[str, tuple[str, Maker]] = {
     "residual": ("the residual", sections.residual_figures),
@@ -163,6 +168,7 @@ WITHOUT_DRAWS: dict[str, tuple[str, Maker]] = {
     "formulas": ("the equations", _formulas),
     "fit": ("the fit", sections.fit_figures),
     "response": ("the frequency response", sections.response_figures),
+    "viewer": ("the curves of each run", _viewer),
 }
 
 #: The same of the draws, what takes longest last.

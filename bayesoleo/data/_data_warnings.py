@@ -17,7 +17,7 @@ import numpy as np
 from scipy import fft, stats
 
 from bayesoleo._types import Array
-from bayesoleo.data._fourier import HarmonicBasis
+from bayesoleo.data._fourier import HarmonicBasis, basis_of
 from bayesoleo.data._harmonics import foreign_lines
 from bayesoleo.data._noise import average_on, periodic_average
 from bayesoleo.data._quiet_channels import noise_of_channels, quiet_channels
@@ -112,7 +112,7 @@ def drift(values: Array, time_step: float, frequency: float, channel: str = "") 
     time = (np.arange(signal.size) - 0.5 * (signal.size - 1)) / signal.size
     shapes = np.stack((time, time * swing))
     # The average absorbs a part of a trend, which is therefore projected out of the regressors.
-    columns = np.stack([s - periodic_average(s, time_step, frequency).values for s in shapes])
+    columns = shapes - basis_of(signal.size, time_step * frequency).fit(shapes)
     rest = signal - average.values
     # Each column is scaled: that of the amplitude may be negligible beside that of the mean.
     length = np.sqrt(np.mean(columns**2, axis=1, keepdims=True))

@@ -10,6 +10,7 @@ The autocovariance follows from the FFT by the theorem of Wiener and Khinchin.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import cast
 
 import numpy as np
@@ -19,6 +20,8 @@ from bayesoleo._types import Array, ComplexArray
 
 # Part of the largest curvature below which a direction's own is rounding.
 _UNSEEN = 1e-9
+#: Bases that are kept, and samples up to which: 40 MB at most.
+KEPT, KEPT_SAMPLES = 32, 16_384
 
 
 class ChirpTransform:
@@ -130,6 +133,19 @@ class HarmonicBasis:
             previous, power = power, _power(residual)
             direction = residual + power / np.maximum(previous, 1e-300) * direction
         return solution
+
+
+def basis_of(samples: int, step: float) -> HarmonicBasis:
+    """The basis of all harmonics; those asked for last are kept, unless records are long.
+
+    To make one takes half as long as to average a signal, and every residual of a run has the same.
+    """
+    return _kept_basis(samples, step) if samples <= KEPT_SAMPLES else HarmonicBasis(samples, step)
+
+
+@lru_cache(maxsize=KEPT)
+def _kept_basis(samples: int, step: float) -> HarmonicBasis:
+    return HarmonicBasis(samples, step)
 
 
 def highest_order(step: float) -> int:

@@ -36,7 +36,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from bayesoleo._types import Array, Complex, ComplexArray, Float
-from bayesoleo.data._fourier import HarmonicBasis
+from bayesoleo.data._fourier import HarmonicBasis, basis_of
 from bayesoleo.data._sample_quality import step_of
 from bayesoleo.errors import InputError
 
@@ -298,7 +298,7 @@ def periodic_average(values: Array, time_step: float, frequency: float) -> Perio
     """
     signal = np.asarray(values, dtype=float)
     check_length(signal.size, time_step * frequency)
-    return average_on(HarmonicBasis(signal.size, time_step * frequency), signal)
+    return average_on(basis_of(signal.size, time_step * frequency), signal)
 
 
 def average_on(basis: HarmonicBasis, values: Array) -> PeriodicAverage:

@@ -23,7 +23,7 @@ from bayesoleo.prediction._starts import (
     Anchor,
     KnownRows,
     Motion,
-    guess_rows,
+    guesses_of,
     solve_from_shot,
 )
 from bayesoleo.prediction._sum_of_squares import FusedOutputs, squared_distances
@@ -268,15 +268,19 @@ class RunPredictor:
         return self.scheme.plan(phase, self.steps)
 
     def guess(self, p: Array) -> Array:
-        """First guess of the unknowns, shape (1, n, w)."""
+        """First guess of the unknowns at constants ``p (np,)``, shape (1, n, w)."""
+        return self._guesses(p[None])
+
+    def _guesses(self, p: Array) -> Array:
+        """First guesses at constants ``p (L, np)``, shape (L, n, w)."""
         derived = self.kernels.derived
-        constants = dict(zip(derived.constants, p, strict=True))
+        constants = [dict(zip(derived.constants, row, strict=True)) for row in p]
         nodes = np.arange(self.steps) / self.steps
         at_nodes, at_points = (
-            guess_rows(self.model, derived, self.record, constants, phase, self.motions, known)
+            guesses_of(self.model, derived, self.record, constants, phase, self.motions, known)
             for phase, known in zip((nodes, self.points), self._guessed, strict=True)
         )
-        return self.scheme.from_motion(at_nodes[None], at_points[None])
+        return self.scheme.from_motion(at_nodes, at_points)
 
     def set_anchor(self, p: Array) -> Status:
         """Solve at constants ``p (np,)`` and keep the solution as the start of later ones."""
@@ -546,15 +550,15 @@ class RunPredictor:
         """
         if type(self) is not RunPredictor:
             return None
-        guesses = np.concatenate([self.guess(row) for row in p])
+        guesses = self._guesses(p)
         solution = solve_periodic(
             self.boundary, p, guesses, max_iterations=FOLLOWING, monotone=False, exchange=False
         )
         solution, x_p, monodromy = sensitivities(self.boundary, p, solution)
         status = solution.status.copy()
-        for lane in np.flatnonzero(status == Status.CONVERGED.value):
-            if not self._is_known(solution.x[lane], guesses[lane]):
-                status[lane] = Status.NO_CONVERGENCE.value
+        lanes = np.flatnonzero(status == Status.CONVERGED.value)
+        other = ~self._are_known(solution.x[lanes], guesses[lanes])
+        status[lanes[other]] = Status.NO_CONVERGENCE.value
         solved = np.flatnonzero(status == Status.CONVERGED.value)
         if not solved.size:
             return None
@@ -566,18 +570,24 @@ class RunPredictor:
         self.anchor = Anchor(p[k].copy(), solution.x[k], moved, monodromy[k])
         return samples
 
-    def _is_known(self, x: Array, guess: Array) -> bool:
-        """Whether dofs whose motions are known move as they were guessed to."""
-        nodes, derived = np.arange(self.steps) / self.steps, self.kernels.derived
+    def _are_known(self, x: Array, guesses: Array) -> Flags:
+        """Whether dofs whose motions are known move as they were guessed to, ``(L,)``, in unknowns
+        ``x (L, n, w)``."""
+        derived, step = self.kernels.derived, self.boundary.step(self.steps)
         starts = np.cumsum([0, *(order + 1 for order in derived.orders)])
         known = [
             int(a) for dof, a in zip(derived.dofs, starts, strict=False) if dof in self.motions
         ]
-        expected = self.rows(guess, nodes)[known]
-        away = np.linalg.norm(self.rows(x, nodes)[known] - expected, axis=1)
-        about = np.linalg.norm(expected - expected.mean(axis=1, keepdims=True), axis=1)
-        whole = np.linalg.norm(expected, axis=1)
-        return bool(np.all(away <= np.maximum(KEPT * about, AT_REST * whole)))
+        plan = self._at(np.arange(self.steps) / self.steps)
+        found, expected = (
+            self.scheme.sample(unknowns[..., None], plan, step)[:, known, 0]
+            for unknowns in (x, guesses)
+        )
+        away = np.linalg.norm(found - expected, axis=2)
+        about = np.linalg.norm(expected - expected.mean(axis=2, keepdims=True), axis=2)
+        whole = np.linalg.norm(expected, axis=2)
+        same = away <= np.maximum(KEPT * about, AT_REST * whole)
+        return np.asarray(same.all(axis=1), dtype=np.bool_)
 
     def _moves_like(self, other: RunPredictor) -> bool:
         """Whether unknowns mean the same: one mesh, and the same states in the same order."""
@@ -699,14 +709,15 @@ class RunPredictor:
         self, status: Integers, z: Array, inputs: Array, p: Array, y: Array, lanes: Integers
     ) -> Integers:
         """Mark lanes whose outputs are not finite or whose samples leave the admissible region."""
-        finite = np.isfinite(y[lanes]).all(axis=(1, 2))
+        finite = np.isfinite(y).all(axis=(1, 2))[lanes]
         inside = np.ones(lanes.size, dtype=np.bool_)
         if self.boundary.conditions:
             a = np.ones((p.shape[0], self.boundary.conditions, y.shape[2]))
             with np.errstate(all="ignore"):
                 self.kernels.admissible(z, inputs, p, lanes, a)
-            finite &= ~np.isnan(a[lanes]).any(axis=(1, 2))
-            inside = ~(a[lanes] <= 0).any(axis=(1, 2))
+                least = a.min(axis=(1, 2), initial=np.inf)[lanes]  # no number where one is none
+            finite &= ~np.isnan(least)
+            inside = ~(least <= 0)
         status = _failing(status, lanes, finite, inside)
         y[status != Status.CONVERGED.value] = np.nan
         return status

@@ -79,18 +79,34 @@ def guess_rows(
 
     With ``known_rows``, of the same record and phases, channels are evaluated once only.
     """
+    found = guesses_of(model, derived, record, [constants], phase, motions, known_rows)
+    return cast(Array, found[0])
+
+
+def guesses_of(
+    model: Model,
+    derived: Derived,
+    record: Record,
+    constants: Sequence[Mapping[str, float]],
+    phase: Array,
+    motions: Mapping[str, Motion] | None = None,
+    known_rows: KnownRows | None = None,
+) -> Array:
+    """The same for several sets of constants, shape (L, nz, N): what does not depend on them is
+    evaluated once."""
     rows: list[Array] = []
     for dof, order in zip(derived.dofs, derived.orders, strict=True):
         if motions is not None and dof in motions:
             known = motions[dof](phase)
             if known.shape[0] == order + 1:
-                rows.extend(known)
+                rows.extend(np.broadcast_to(row, (len(constants), phase.size)) for row in known)
                 continue
         expression = _measured_motion(model, dof, record) or _declared(model, dof)
         for _ in range(order + 1):
-            rows.append(_evaluate(expression, record, constants, phase, known_rows))
+            each = [_evaluate(expression, record, one, phase, known_rows) for one in constants]
+            rows.append(np.stack(each))
             expression = total_derivative(expression, list(record.harmonics))
-    return np.stack(rows) if rows else np.empty((0, phase.size))
+    return np.stack(rows, axis=1) if rows else np.empty((len(constants), 0, phase.size))
 
 
 def _measured_motion(model: Model, dof: str, record: Record) -> sp.Expr | None:

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from bayesoleo.data._fourier import ChirpTransform, HarmonicBasis, highest_order
+from bayesoleo.data._fourier import (
+    KEPT_SAMPLES,
+    ChirpTransform,
+    HarmonicBasis,
+    basis_of,
+    highest_order,
+)
 
 
 @pytest.mark.parametrize("step", [0.0301, -0.2, 1 / 37.3])
@@ -52,3 +58,23 @@ def test_harmonics_that_a_whole_period_cannot_tell_apart_do_no_harm(period, samp
     values = one[np.arange(samples) % period]
     basis = HarmonicBasis(samples, (1 + off) / period, period // 2 + 1)
     np.testing.assert_allclose(basis.fit(values), values, atol=1e-6)
+
+
+def test_the_basis_of_a_run_is_made_once_and_that_of_a_long_record_is_not_kept():
+    one, step = np.random.default_rng(5).normal(size=400), 1 / 37.3
+    kept = basis_of(400, step)
+    assert basis_of(400, step) is kept
+    np.testing.assert_array_equal(kept.fit(one), HarmonicBasis(400, step).fit(one))
+    for samples, other in ((401, step), (400, step * (1 + 1e-12))):
+        assert basis_of(samples, other) is not kept
+        assert (basis_of(samples, other).samples, basis_of(samples, other).step) == (samples, other)
+    long = KEPT_SAMPLES + 1
+    assert basis_of(long, step) is not basis_of(long, step)
+
+
+def test_signals_together_are_averaged_as_each_alone():
+    basis = HarmonicBasis(400, 1 / 37.3)
+    signals = np.random.default_rng(6).normal(size=(3, 400)) * [[1.0], [1e6], [1e-6]]
+    for one, together in zip(signals, basis.fit(signals), strict=True):
+        # Transforms of several signals may differ from those of one in the last digits.
+        np.testing.assert_allclose(together, basis.fit(one), rtol=0, atol=1e-12 * np.abs(one).max())

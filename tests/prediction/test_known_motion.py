@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from synthetic_runs import run, stroke
 
-from bayesoleo.model import Model, Output, Parameter
+from bayesoleo.model import Dof, Model, Output, Parameter
 from bayesoleo.prediction._predictor import Predictor
 from bayesoleo.solvers._collocation import Collocation
 from bayesoleo.solvers._orbit import Status
@@ -174,6 +174,24 @@ def test_states_that_follow_a_motion_are_found_for_every_set(known):
         np.testing.assert_allclose(found.y_p[k, :, 0], expected, atol=2e-3 * scale)
     assert run_.anchor is not None
     np.testing.assert_array_equal(run_.anchor.p, p[0])
+
+
+def test_guesses_of_several_sets_are_those_of_each(known):
+    """Known motions are asked for once, at the nodes and at the points of the mesh."""
+    model = with_memory()
+    model = replace(model, dofs=model.dofs | {"z": Dof("1", guess="x*rate")})
+    run_, p = following(known, model, rate=[0.3, 20.0, 1000.0])
+    each = np.concatenate([run_.guess(row) for row in p])
+    asked, motion = [], run_.motions["q"]
+
+    def counted(phase):
+        asked.append(phase.size)
+        return motion(phase)
+
+    run_.motions = {"q": counted}
+    np.testing.assert_array_equal(run_._guesses(p), each)
+    assert len(asked) == 2
+    assert not np.array_equal(each[0], each[1])
 
 
 def test_states_that_act_on_the_motion_do_not_follow_it(known):
