@@ -20,7 +20,7 @@ from bayesoleo._types import Array, ComplexArray
 
 # Part of the largest curvature below which a direction's own is rounding.
 _UNSEEN = 1e-9
-#: Bases that are kept, and samples up to which: 40 MB at most.
+#: Bases that are kept, and samples up to which: 50 MB at most.
 KEPT, KEPT_SAMPLES = 32, 16_384
 
 

@@ -715,9 +715,9 @@ class RunPredictor:
             a = np.ones((p.shape[0], self.boundary.conditions, y.shape[2]))
             with np.errstate(all="ignore"):
                 self.kernels.admissible(z, inputs, p, lanes, a)
-                least = a.min(axis=(1, 2), initial=np.inf)[lanes]  # no number where one is none
-            finite &= ~np.isnan(least)
-            inside = ~(least <= 0)
+                # The least is no number where one is none, and of numbers alone it is one.
+                finite &= ~np.isnan(a.min(axis=(1, 2), initial=np.inf)[lanes])
+                inside = np.fmin.reduce(a, axis=(1, 2), initial=np.inf)[lanes] > 0
         status = _failing(status, lanes, finite, inside)
         y[status != Status.CONVERGED.value] = np.nan
         return status

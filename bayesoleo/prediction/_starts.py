@@ -92,8 +92,7 @@ def guesses_of(
     motions: Mapping[str, Motion] | None = None,
     known_rows: KnownRows | None = None,
 ) -> Array:
-    """The same for several sets of constants, shape (L, nz, N): what does not depend on them is
-    evaluated once."""
+    """The same for sets of constants, shape (L, nz, N); known motions are evaluated once."""
     rows: list[Array] = []
     for dof, order in zip(derived.dofs, derived.orders, strict=True):
         if motions is not None and dof in motions:

@@ -249,3 +249,27 @@ def test_a_predictor_sent_to_another_process_is_the_same(predictor, vectors, who
     assert squares.tobytes() == whole[0].tobytes()
     np.testing.assert_array_equal(status, whole[1])
     assert copy.copy(predictor).runs is predictor.runs
+
+
+@pytest.mark.parametrize("backend", ["numpy", "numba"])
+def test_a_broken_condition_is_told_where_another_one_is_no_number(backend):
+    """By whole arrays, which have derivatives, as by blocks of samples."""
+    model = Model(
+        "spring",
+        inputs={"x": "N"},
+        dofs={"q": "m"},
+        equations={"q": "ddot(q) + 0.4*dot(q) + 30*q - x"},
+        outputs={"y": Output("q", "m")},
+        parameters={"b": Parameter(1.0, sd=1.0)},
+        admissible=("b - q", "sqrt(b - q) + 1"),
+    )
+    record = run("one", {"x": stroke(0.0, 2.0)}, 0.8, {}, others=("y",))
+    one = Predictor(model, [record], steps=STEPS, backend=backend, jobs=1).runs[0]
+    p = one.base_constants()[None]
+    assert one.set_anchor(p[0]) is Status.CONVERGED
+    x, x_p = one.anchor.x[None], np.moveaxis(one.anchor.x_p, 0, 2)[None]
+    beyond = np.zeros_like(p)  # half of the motion
+    for derivatives in (False, True):
+        found = one._at_samples(beyond, x, x_p, np.zeros(1, dtype=np.int64), derivatives)
+        assert list(found.status) == [Status.INADMISSIBLE.value]
+        assert np.isnan(found.y).all()
