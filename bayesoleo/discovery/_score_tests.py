@@ -77,10 +77,7 @@ def inflation_of(base: Base, directions: Sequence[Array]) -> tuple[float, int]:
     white = sum(float(d @ d) for d in directions)
     if not white > 0:
         return 1.0, 0
-    parts = [
-        _by_spectrum(run, d, _spectra(base, r, d))
-        for r, (run, d) in enumerate(zip(base.runs, directions, strict=True))
-    ]
+    parts = [_by_spectrum(base, r, direction) for r, direction in enumerate(directions)]
     variance = sum(value for value, _ in parts)
     scatter = sum(value**2 / free for value, free in parts if free > 0)
     freedom = variance**2 / scatter if scatter > 0 else ASSUMED
@@ -118,21 +115,21 @@ def inflation_by_estimate(base: Base, changes: Sequence[Array]) -> tuple[float, 
     return value + moved / white, freedom
 
 
-def _spectra(base: Base, r: int, direction: Array) -> tuple[NoiseSpectrum, ...]:
+def _spectra(
+    base: Base, r: int, direction: Array, powers: Sequence[Array]
+) -> tuple[NoiseSpectrum, ...]:
     """Spectra of a run's noise, without what a direction that does not repeat would explain of it.
 
     A drift lies between the harmonics, where noise is measured: it must not count as its own noise.
+    ``powers`` are those of the direction by the spectra as they were measured.
     """
     run = base.runs[r]
-    if not run.spectra:
-        return ()
-    parts = direction.reshape(len(run.spectra), -1)
     most = base.policy.aperiodic_power
-    if not any(_wanders(part, s, most) for part, s in zip(parts, run.spectra, strict=True)):
+    if not any(_wanders(power, s, most) for power, s in zip(powers, run.spectra, strict=True)):
         return run.spectra
     record, found = base.fit.records[r], []
     step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
-    for k, left in enumerate((run.residual - direction).reshape(parts.shape)):
+    for k, left in enumerate((run.residual - direction).reshape(len(run.spectra), -1)):
         average = periodic_average(left, step, record.frequency)
         unit = run.scale[k * left.size]
         rest = (left - average.values) / unit
@@ -140,23 +137,22 @@ def _spectra(base: Base, r: int, direction: Array) -> tuple[NoiseSpectrum, ...]:
     return tuple(found)
 
 
-def _wanders(signal: Array, spectrum: NoiseSpectrum, most: float) -> bool:
-    """Whether a good part of a signal does not repeat from period to period."""
-    power = spectrum.power(signal)
+def _wanders(power: Array, spectrum: NoiseSpectrum, most: float) -> bool:
+    """Whether a good part of a signal of such power does not repeat from period to period."""
     return bool(power.sum() - power[:: spectrum.lines].sum() > most * power.sum())
 
 
-def _by_spectrum(
-    run: RunBase, direction: Array, spectra: tuple[NoiseSpectrum, ...]
-) -> tuple[float, float]:
+def _by_spectrum(base: Base, r: int, direction: Array) -> tuple[float, float]:
     """Variance of the score of one run and its degrees of freedom, zero where it is assumed."""
-    if not spectra:
+    run = base.runs[r]
+    if not run.spectra:
         return float(direction @ direction), 0.0
-    size, variance, scatter = direction.size // len(spectra), 0.0, 0.0
-    for k, spectrum in enumerate(spectra):
-        part = slice(k * size, (k + 1) * size)
-        power = spectrum.power(direction[part]) * run.scale[part][0] ** 2
-        own, free = float(power @ spectrum.level), spectrum.freedom(power)
+    parts = direction.reshape(len(run.spectra), -1)
+    powers = [spectrum.power(part) for part, spectrum in zip(parts, run.spectra, strict=True)]
+    spectra, variance, scatter = _spectra(base, r, direction, powers), 0.0, 0.0
+    for k, (power, spectrum) in enumerate(zip(powers, spectra, strict=True)):
+        own_power = power * run.scale[k * parts.shape[1]] ** 2
+        own, free = float(own_power @ spectrum.level), spectrum.freedom(own_power)
         variance += own
         scatter += own**2 / free if free > 0 else 0.0
     return variance, variance**2 / scatter if scatter > 0 else 0.0
