@@ -654,18 +654,16 @@ def _begun(
     if not state.at_floor:
         callback("the residual exceeds the expected error: try other starts")
         start = better_start(state.fit, numerics, partial(_prepare, state, effects))
-        found = None if start is None else fit_state(
-            assembly, roles, numerics, start=start, progress=callback
-        )  # fmt: skip
-        # The other start was followed to near its optimum only.
-        if found is not None and found.fit.point.objective > state.fit.point.objective:
-            forget_options()
+        if start is not None:
+            found = fit_state(assembly, roles, numerics, start=start, progress=callback)
             rise = found.fit.point.objective - state.fit.point.objective
-            notes.append(
-                f"{OTHER_OPTIMUM} by {rise:.3g} in log density: check the declared values and"
-                " priors"
-            )
-            state = found
+            if rise > 0:  # else the start, which was followed to near its optimum, promised more
+                forget_options()
+                state = found
+                notes.append(
+                    f"{OTHER_OPTIMUM} by {rise:.3g} in log density: check the declared values and"
+                    " priors"
+                )
     return Progress(state, state, notes=tuple(notes))
 
 

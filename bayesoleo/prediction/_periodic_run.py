@@ -715,7 +715,7 @@ class RunPredictor:
             a = np.ones((p.shape[0], self.boundary.conditions, y.shape[2]))
             with np.errstate(all="ignore"):
                 self.kernels.admissible(z, inputs, p, lanes, a)
-                # The least is no number where one is none, and of numbers alone it is one.
+                # A minimum that keeps what is no number, and one that leaves it out.
                 finite &= ~np.isnan(a.min(axis=(1, 2), initial=np.inf)[lanes])
                 inside = np.fmin.reduce(a, axis=(1, 2), initial=np.inf)[lanes] > 0
         status = _failing(status, lanes, finite, inside)

@@ -399,6 +399,21 @@ def test_one_figure_of_a_kind_that_fails_leaves_the_others(oleo, unpainted, monk
     assert left == whole - outputs > 0
 
 
+def test_curves_that_fail_leave_a_page_without_them_that_says_so(
+    oleo, unpainted, monkeypatch, tmp_path
+):
+    def failing(tree):
+        raise ValueError("no curves")
+
+    monkeypatch.setattr(sections, "viewer", failing)
+    (said,) = write_report(oleo, tmp_path / "without.html")
+    assert "curves of each run" in said
+    assert "no curves" in said
+    text = (tmp_path / "without.html").read_text(encoding="utf-8")
+    assert "no curves" in text
+    assert 'id="viewer"' not in text
+
+
 @pytest.mark.slow
 def test_figures_of_another_process_are_the_same(oleo, page, monkeypatch):
     monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
