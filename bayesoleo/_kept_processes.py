@@ -7,6 +7,7 @@ for a while ends, and so do all when the one that started them does.
 from __future__ import annotations
 
 import atexit
+import ctypes
 import gc
 import importlib
 import json
@@ -33,6 +34,13 @@ EARLY = "arviz_base"
 #: records live on in hundred thousands, and little of them is garbage: at Python's 2000, 10 and 10
 #: the searches take four hundredths of a command's time.
 SELDOM = 200_000, 10, 10
+#: Settings of the GNU C library and their values in such a process: bytes from which an array has
+#: pages of its own, and bytes free at the end of the heap from which they go back to the system.
+#: At its own values arrays of a megabyte get new pages, which are filled with zeros, again and
+#: again: a third of all page faults of a command, half a second.
+MMAP_THRESHOLD, TRIM_THRESHOLD = (-3, 2**25), (-1, 2**28)
+#: Bytes that a pipe holds, where the system lets it: messages have megabytes.
+PIPE = 2**20
 #: It finds modules where its parent finds them, and does not run the user's script again.
 _CHILD = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]);"
@@ -66,6 +74,7 @@ class Worker:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             env=environment,
+            pipesize=PIPE,
         )
 
     def ask(self, message: Message, known: Sequence[Any] = ()) -> tuple[str, Any]:
@@ -213,6 +222,7 @@ def load(modules: Sequence[str]) -> None:
     finally:
         gc.freeze()
         search_seldom()
+        keep_memory()
         if was_on:
             gc.enable()
 
@@ -221,6 +231,14 @@ def search_seldom() -> None:
     """Search for garbage less often than Python does, where it does at all."""
     if 0 < gc.get_threshold()[0] < SELDOM[0]:
         gc.set_threshold(*SELDOM)
+
+
+def keep_memory() -> None:
+    """Keep memory that arrays have left for the next ones, where the C library can be told so."""
+    with suppress(OSError, AttributeError, TypeError):
+        set_option = ctypes.CDLL(None).mallopt
+        for option, value in (MMAP_THRESHOLD, TRIM_THRESHOLD):
+            set_option(option, value)
 
 
 def serve(modules: Sequence[str]) -> None:
@@ -236,6 +254,7 @@ def serve(modules: Sequence[str]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     parallel.limit_threads(1)
     search_seldom()
+    keep_memory()
     source, target = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what is printed must not get among the messages
     load(modules)

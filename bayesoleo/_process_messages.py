@@ -9,8 +9,11 @@ import sys
 from collections.abc import Sequence
 from typing import Any, BinaryIO
 
+import numpy as np
+from numpy.typing import NDArray
+
 #: A message: a pickle, and the memory of its large arrays, which is not copied into it.
-type Message = list[memoryview | bytes | bytearray]
+type Message = list[memoryview | bytes | bytearray | NDArray[np.uint8]]
 _HEADER = struct.Struct("<Q")
 #: Bytes from which an array is sent beside the pickle: arrays take a copy less on either side.
 LARGE = 2**16
@@ -100,9 +103,9 @@ def _number(pipe: BinaryIO) -> int | None:
     return _HEADER.unpack(head)[0] if len(head) == _HEADER.size else None
 
 
-def _filled(pipe: BinaryIO, size: int) -> bytearray | None:
+def _filled(pipe: BinaryIO, size: int) -> NDArray[np.uint8] | None:
     """So many bytes, which an array may take for its own memory; None where the pipe ends."""
-    part, at = bytearray(size), 0
+    part, at = np.empty(size, np.uint8), 0  # bytes of Python's would be filled with zeros first
     while at < size:
         got = pipe.readinto(memoryview(part)[at:])  # type: ignore[attr-defined]
         if not got:

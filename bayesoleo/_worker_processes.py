@@ -391,6 +391,7 @@ class Beside[S, R]:
         self._function, self._message, self._more = function, message, list[Message]()
         self._found: list[tuple[str, Any]] = []
         self._items: dict[int, Any] = {}
+        self._last, self._over, self._lock = list[Message](), False, threading.Lock()
         self._answered, self._enough = threading.Event(), threading.Event()
         self._dropped = False
         self._freed = threading.Lock()
@@ -448,10 +449,34 @@ class Beside[S, R]:
         LostError
             If they cannot be sent.
         """
-        more = [(function, shared, None), *((0, item) for item in items)]
-        messages = [as_it_is(sent(one)) for one in more]
+        messages = _messages_of(function, shared, items)
         if not self.answered:
             self._more[:] = messages
+
+    def end_with[T](self, function: Callable[[Any, T], Any], shared: Any, item: T) -> None:
+        """Have the process do one more item, next, and no other after it; nothing where it has come
+        to its end before this.
+
+        Parameters
+        ----------
+        function, shared, item
+            As of :func:`process_map`, taken as they are now.
+
+        Raises
+        ------
+        LostError
+            If they cannot be sent.
+        """
+        messages = _messages_of(function, shared, [item])
+        with self._lock:
+            if not self._over:
+                self._last[:] = messages
+        self._enough.set()
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether the process does, or begins, what comes after the call."""
+        return self.answered and not self._over
 
     @classmethod
     def may_begin(cls, jobs: int | None = None) -> bool:
@@ -489,15 +514,23 @@ class Beside[S, R]:
             forget(0)
         finally:
             self._answered.set()
+            self._over = True
             self._free()
 
     def _go_on(self, worker: Worker) -> None:
         for number, message in enumerate(self._more):
             if self._enough.is_set():
-                return
-            kind, value = worker.ask(message)
-            if kind == VALUE:
-                self._items[number - 1] = value  # the first message says what is to be done
+                break
+            self._done(worker, message, number)
+        with self._lock:
+            self._over = not self._last
+        for number, message in enumerate(self._last, len(self._more)):
+            self._done(worker, message, number)
+
+    def _done(self, worker: Worker, message: Message, number: int) -> None:
+        kind, value = worker.ask(message)
+        if kind == VALUE:
+            self._items[number - 1] = value  # the first message says what is to be done
 
     def __enter__(self) -> Self:
         return self
@@ -537,6 +570,14 @@ class Beside[S, R]:
         self._enough.set()
         self._thread.join()
         return dict(self._items)
+
+
+def _messages_of(
+    function: Callable[[Any, Any], Any], shared: Any, items: Sequence[Any]
+) -> list[Message]:
+    """What a process is sent to do some items: first what is to be done."""
+    parts = [(function, shared, None), *((0, item) for item in items)]
+    return [as_it_is(sent(one)) for one in parts]
 
 
 def _called(function: Callable[[Any], Any], argument: Any) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import io
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -92,6 +93,41 @@ def test_searches_for_garbage_that_are_off_stay_off(tmp_path):
         " load(['wave']); assert gc.get_threshold()[0] == 0"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
+def test_memory_that_arrays_have_left_serves_the_next_ones():
+    """In a process of its own, since the setting lasts: no new page, which the system would fill
+    with zeros."""
+    code = (
+        "import resource, sys; import numpy as np;"
+        " from bayesoleo._kept_processes import keep_memory;"
+        " faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt;"
+        " work = lambda: [len([np.ones(300_000) for _ in range(4)]) for _ in range(20)];"
+        " keep_memory() if sys.argv[1] == 'kept' else None;"
+        " work(); before = faults(); work(); print(faults() - before)"
+    )
+    kept, usual = (
+        int(
+            subprocess.run(
+                [sys.executable, "-c", code, how], capture_output=True, check=True
+            ).stdout
+        )
+        for how in ("kept", "usual")
+    )
+    # 80 arrays of 586 pages: a few faults are those of Python itself.
+    assert kept < 500 < 20_000 < usual
+
+
+@pytest.mark.parametrize("library", [OSError, TypeError, None])
+def test_where_the_library_cannot_be_told_nothing_happens(monkeypatch, library):
+    def opened(name):
+        if library is not None:
+            raise library
+        return object()
+
+    monkeypatch.setattr(kept_processes.ctypes, "CDLL", opened)
+    kept_processes.keep_memory()
 
 
 def test_short_work_starts_no_process(monkeypatch):
@@ -486,6 +522,42 @@ def test_other_work_may_be_named_once_the_call_goes_on(eager):
     assert beside.result()[1] == 10
     assert beside.taken() == {}
     assert not processes._in_use.locked()
+
+
+def test_it_may_end_with_one_more_item_before_all_others(eager):
+    beside = processes.Beside.begun(where_and_twice, 1, 2, (waits, None, [0.05, 1.0, *[30.0] * 9]))
+    assert beside.result()[1] == 2
+    while 0 not in beside._items:
+        time.sleep(0.01)
+    assert beside.goes_on
+    beside.end_with(shifted, 100, 7)
+    found = beside.taken()
+    assert (found.pop(0), found.pop(1)) == (0.05, 1.0)  # the one that it was at comes too
+    assert [value for _, value in found.values()] == [107]
+    assert not beside.goes_on
+    beside.end_with(shifted, 100, 8)  # too late
+    assert beside.taken() == {0: 0.05, 1: 1.0, **found}
+    assert not processes._in_use.locked()
+
+
+def test_what_it_cannot_be_sent_takes_nothing_from_the_rest(eager):
+    beside = processes.Beside.begun(where_and_twice, 1, 2, (waits, None, [0.5, 0.01]))
+    assert beside.result()[1] == 2
+    with pytest.raises(kept_processes.LostError):
+        beside.end_with(shifted, 100, Unsendable())
+    beside._thread.join()
+    assert beside.taken() == {0: 0.5, 1: 0.01}
+
+
+def test_a_process_lost_before_its_last_item_leaves_what_it_had_done(eager):
+    beside = processes.Beside.begun(where_and_twice, 1, 2, (waits, None, [0.01, 60.0]))
+    assert beside.result()[1] == 2
+    while 0 not in beside._items:
+        time.sleep(0.01)
+    beside.end_with(shifted, 100, 7)
+    kept_processes.kill_processes()
+    assert beside.taken() == {0: 0.01}
+    assert not beside.goes_on
 
 
 def waits_and_doubles(seconds):

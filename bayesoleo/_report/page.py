@@ -13,7 +13,7 @@ import xarray as xr
 
 from bayesoleo import _schema as schema
 from bayesoleo._report import sections, sentences, structures, tables
-from bayesoleo._report.page_figures import Pictures, figures_of
+from bayesoleo._report.page_figures import Ahead, figures_of
 from bayesoleo._report.sentences import begin, in_run, role_shown
 from bayesoleo._report.structures import proposal_lines, proposal_table
 from bayesoleo._report.tables import (
@@ -302,7 +302,7 @@ def write_report(
     tree: xr.DataTree,
     path: str | os.PathLike[str],
     before: Callable[[], object] = lambda: None,
-    ahead: Callable[[], Pictures] | None = None,
+    ahead: Ahead | None = None,
 ) -> list[str]:
     """Write the report of a result as a self-contained HTML page.
 
@@ -314,8 +314,8 @@ def write_report(
         Replaced as a whole or not at all.
     before : callable
         What this process does before it draws, while another one draws.
-    ahead : callable, optional
-        Asked after that for the figures that exist, as :func:`draw_ahead` drew them.
+    ahead : Ahead, optional
+        Another process that has drawn figures, and goes on with it.
 
     Returns
     -------
@@ -340,7 +340,7 @@ def render_report(tree: xr.DataTree) -> str:
 def _render(
     tree: xr.DataTree,
     before: Callable[[], object],
-    ahead: Callable[[], Pictures] | None = None,
+    ahead: Ahead | None = None,
 ) -> tuple[str, list[str]]:
     """The page, and the figures that it lacks."""
     import jinja2

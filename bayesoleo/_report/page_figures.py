@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from functools import partial
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import matplotlib
 import xarray as xr
@@ -32,13 +32,10 @@ def figures_of(
     summary: dict[str, Any],
     drawing: sections.Drawing,
     before: Callable[[], object],
-    ahead: Callable[[], Pictures] | None,
+    ahead: Ahead | None,
 ) -> dict[str, list[Any]]:
     """All that is drawn, by its place on the page; in several processes."""
-    known = dict[Part, list[Any]]()
-    if ahead is not None:
-        before()  # the other process goes on drawing meanwhile
-        known = dict(ahead())
+    known = {} if ahead is None else _drawn_ahead(tree, before, ahead)
     makers = _makers(summary)
     every = _parts(tree, makers, drawing)
     left = [part for part in every if part not in known]
@@ -51,6 +48,42 @@ def figures_of(
     return {
         kind: [one for part in every if part[0] == kind for one in known[part]] for kind in makers
     }
+
+
+class Ahead(Protocol):
+    """Another process that draws figures ahead."""
+
+    @property
+    def drawn(self) -> Pictures:
+        """What has been drawn in this process."""
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether it draws."""
+
+    def end_with(self, tree: xr.DataTree, part: Part) -> None:
+        """Have it draw this figure next, and no other after it."""
+
+    def pictures(self) -> Pictures:
+        """All that has been drawn, when it has come to its end."""
+
+
+def _drawn_ahead(
+    tree: xr.DataTree, before: Callable[[], object], ahead: Ahead
+) -> dict[Part, list[Any]]:
+    """What another process has drawn. While it draws the largest figure, results are written here,
+    and other figures of the draws are drawn."""
+    here, shared = dict[Part, list[Any]](), shared_by(tree)
+    others = [part for part in parts_of_draws(tree) if part not in ahead.drawn]
+    if LARGEST in others:
+        others.remove(LARGEST)
+        ahead.end_with(tree, LARGEST)
+    before()
+    for part in others:
+        if not ahead.goes_on:
+            break
+        here |= dict(filter(None, [draw_ahead(shared, part)]))
+    return {**here, **ahead.pictures()}
 
 
 def _parts(
@@ -98,10 +131,14 @@ def draw_ahead(
 def _makers(summary: dict[str, Any]) -> dict[str, tuple[str, Maker]]:
     """What is drawn in words, and the function that draws it.
 
-    Processes take them from both ends, so that what takes longest stands there.
+    Processes take them from both ends, so that what takes longest stands there. What another one
+    takes while it draws the largest figure, the last, waits for that: little stands before it.
     """
     first, last = ("residual", "fit", "where"), ("viewer", "formulas", "response", "data")
-    makers: dict[str, tuple[str, Maker]] = {name: WITHOUT_DRAWS[name] for name in first} | {
+    makers: dict[str, tuple[str, Maker]] = {
+        **{name: WITHOUT_DRAWS[name] for name in first},
+        "predictive": OF_DRAWS["predictive"],
+        **{name: WITHOUT_DRAWS[name] for name in last},
         "structures": ("the probabilities of structures", sections.structures_figure),
         "error": ("the error of each run", sections.error_figure),
     }
@@ -113,12 +150,7 @@ def _makers(summary: dict[str, Any]) -> dict[str, tuple[str, Maker]]:
     for number, entry in enumerate(summary.get("proposals", [])):
         proposal = partial(sections.proposal_figure, entry=entry)
         makers[f"proposal {number}"] = ("the next run", proposal)
-    return makers | {
-        "trace": OF_DRAWS["trace"],
-        **{name: WITHOUT_DRAWS[name] for name in last},
-        "predictive": OF_DRAWS["predictive"],
-        "posterior": OF_DRAWS["posterior"],
-    }
+    return makers | {"trace": OF_DRAWS["trace"], "posterior": OF_DRAWS["posterior"]}
 
 
 def _drawing_settings() -> dict[str, Any]:
@@ -170,6 +202,9 @@ WITHOUT_DRAWS: dict[str, tuple[str, Maker]] = {
     "response": ("the frequency response", sections.response_figures),
     "viewer": ("the curves of each run", _viewer),
 }
+
+#: The figure of all pairs of parameters, which takes as long as ten others.
+LARGEST: Part = ("posterior", 0)
 
 #: The same of the draws, what takes longest last.
 OF_DRAWS: dict[str, tuple[str, Maker]] = {

@@ -18,7 +18,7 @@ import xarray as xr
 
 from bayesoleo import _schema as schema
 from bayesoleo._first_compilation import is_marked
-from bayesoleo._report.page_figures import Pictures
+from bayesoleo._report.page_figures import Ahead, Pictures
 from bayesoleo._types import ProgressCallback
 from bayesoleo._worker_processes import Beside, start_ahead
 from bayesoleo._workflow.estimating import NOT_SAMPLED, draw, inference_for
@@ -27,7 +27,6 @@ from bayesoleo._workflow.output import (
     PROPOSALS_STAGE,
     REPORT_STAGE,
     SEARCH_STAGE,
-    Ahead,
     Drawn,
     Groups,
     ResultFolder,
@@ -44,12 +43,12 @@ from bayesoleo._workflow.settings import Settings
 from bayesoleo._workflow.structures_beside import (
     Answer,
     Asked,
+    DrawnAhead,
     Early,
     answered,
     begun_beside,
     drawn_beside,
     pictures_meanwhile,
-    pictures_of,
 )
 from bayesoleo._workflow.task import Source, Task, prepare, silent
 from bayesoleo.discovery._compile_ahead import compile_meanwhile
@@ -108,9 +107,10 @@ def close(
     """Close the loop: estimate, find what is missing, add it, sample the posterior, compare before
     and after.
 
-    What is known is kept as soon as it is known, the estimate and each round: the same call, with
-    the same campaign, model and settings, goes on after the last finished round. While the search
-    goes on, its result so far is written as well, once a minute at most.
+    The estimate and each round are kept when they are known, where other processes help as soon as
+    these work on what comes next: the same call, with the same campaign, model and settings, goes
+    on after the last finished round. While the search goes on, its result so far is written as
+    well, once a minute at most.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def close(
                 if not first:
                     callback("compare structures")
                     loop, questions = with_structures(task, loop, beside.result(), stages)
-                ahead = partial(_all_pictures, beside, pictures)
+                ahead = DrawnAhead(beside, pictures)
         return written(task, loop, drawn, output, stages, questions, groups, ahead)
 
 
@@ -251,11 +251,6 @@ def _pictures_of_draws(
         tree, _ = result_tree(task, loop, drawn, output, Stages(), (), groups)
         return pictures_meanwhile(beside, tree)
     return {}
-
-
-def _all_pictures(beside: Beside[Asked, Answer], pictures: Pictures) -> Pictures:
-    """Figures that the other process has drawn, and those from here."""
-    return {**pictures_of(beside), **pictures}
 
 
 def with_structures(

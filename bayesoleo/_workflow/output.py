@@ -21,7 +21,7 @@ import xarray as xr
 
 from bayesoleo import _schema as schema
 from bayesoleo._report.page import write_report
-from bayesoleo._report.page_figures import Pictures
+from bayesoleo._report.page_figures import Ahead
 from bayesoleo._report.sentences import headline, response_entries
 from bayesoleo._report.terminal import write_plain_report
 from bayesoleo._storage.files import (
@@ -305,7 +305,6 @@ def reason_of(error: Exception) -> str:
 
 Drawn = tuple[Samples, LogDensity]
 Groups = dict[str, xr.Dataset]
-Ahead = Callable[[], Pictures]
 
 
 def write_result(
@@ -334,8 +333,8 @@ def write_result(
         What it left to be told apart, and by which runs that could be done.
     groups : mapping of str to Dataset, optional
         What :func:`result_groups` has made of it, if that was done before.
-    ahead : callable, optional
-        Gives the figures that have been drawn before, by kind and number.
+    ahead : Ahead, optional
+        Another process that draws figures.
     """
     tree, summary = result_tree(task, loop, drawn, output, stages, questions, groups)
     if output.folder is None:

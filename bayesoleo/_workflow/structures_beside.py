@@ -189,9 +189,36 @@ class Early[K]:
             self._beside.drop()
 
 
-def pictures_of(beside: Beside[Asked, Answer]) -> Pictures:
-    """The figures that it has drawn."""
-    return dict(drawn for drawn in beside.taken().values() if drawn is not None)
+@dataclass(frozen=True)
+class DrawnAhead:
+    """Figures drawn ahead: an :class:`~bayesoleo._report.page_figures.Ahead`.
+
+    Parameters
+    ----------
+    beside : Beside
+        Has its answer.
+    drawn : mapping
+        Figures that were drawn in this process.
+    """
+
+    beside: Beside[Asked, Answer]
+    drawn: Pictures
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether the other process draws."""
+        return self.beside.goes_on
+
+    def end_with(self, tree: xr.DataTree, part: Part) -> None:
+        """Have it draw this figure next, and no other after it. What cannot be sent is drawn here,
+        later."""
+        with suppress(Exception):
+            self.beside.end_with(draw_ahead, shared_by(tree), part)
+
+    def pictures(self) -> Pictures:
+        """Figures that the other process has drawn, and those from here."""
+        found = self.beside.taken().values()
+        return {**dict(drawn for drawn in found if drawn is not None), **self.drawn}
 
 
 def pictures_meanwhile(beside: Beside[Asked, Answer], tree: xr.DataTree) -> Pictures:

@@ -29,6 +29,7 @@ from bayesoleo.discovery._corners import beginning, cornered
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._fit_and_hold_out_error import RunError, least_noise, limit
 from bayesoleo.discovery._judged_together import TOGETHER, judged_together
+from bayesoleo.discovery._kept_progress import Kept
 from bayesoleo.discovery._nonparametric_round import nonparametric_notes, with_nonparametric
 from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._policy import SearchPolicy
@@ -376,14 +377,22 @@ def close_loop(
     -------
     ClosedLoop
     """
-    if known is None:
-        known = _begun(assembly, roles, numerics, declared, effects, callback)
-        keep(known)
+    kept = Kept(keep)
     search = SearchOptions(
-        roles, numerics, effects, seed, max_effects, nonparametric, keep, callback, keep_columns,
+        roles, numerics, effects, seed, max_effects, nonparametric, kept, callback, keep_columns,
         most_work,
     )  # fmt: skip
-    known = searched(known, search)
+    with kept:
+        if known is None:
+            known = _begun(assembly, roles, numerics, declared, effects, callback)
+            kept.later(known)
+        return _closed(searched(known, search), search, prior, provisional)
+
+
+def _closed(
+    known: Progress, search: SearchOptions, prior: StructurePrior, provisional: Provisional | None
+) -> ClosedLoop:
+    """The result of a search that has ended, or of one that begins with another effect."""
     drop: Callable[[], None] | None = None
 
     def follow(other: Progress, most: int) -> Progress:
@@ -393,20 +402,24 @@ def close_loop(
             search,
             max_effects=most,
             nonparametric=False,
-            keep=lambda _: None,
+            kept=Kept(),
             keep_columns=False,
             most_work=np.inf,
         )
         return searched(other, quiet)
 
-    roles = _with_noise(roles, known)
+    numerics, callback = search.numerics, search.callback
+    roles = _with_noise(search.roles, known)
     if _went_no_further(known):
         # What it would have found is not among what probabilities are of.
         return loop_of(known.ended(ENDED), roles)
     loop = replace(loop_of(known, roles), without_structures=known)
     if provisional is not None:
         drop = provisional(loop)
-    best = best_of_beam(known, roles, numerics, follow, effects, max_effects, callback)
+    search.kept.now()
+    best = best_of_beam(
+        known, roles, numerics, follow, search.effects, search.max_effects, callback
+    )
     if best is not known:
         loop = replace(loop_of(best, roles), without_structures=best)
     if provisional is not None:
@@ -493,7 +506,7 @@ class SearchOptions:
     seed: int
     max_effects: int
     nonparametric: bool
-    keep: Callable[[Progress], None]
+    kept: Kept
     callback: ProgressCallback
     keep_columns: bool = False
     most_work: float = np.inf
@@ -522,13 +535,15 @@ def searched(known: Progress, search: SearchOptions) -> Progress:
         known = _rounds(known, search)
         if _went_no_further(known):
             break
+        if len(known.state.assembly.steps) > 1:  # else there is nothing to be reviewed
+            search.kept.now()
         roles = _with_noise(search.roles, known)
         known = reviewed(
             known, roles, search.numerics, search.effects, search.callback, replacing=left > 0
         )
         if known.finished:
             break
-        search.keep(known)
+        search.kept.later(known)
     return known
 
 
@@ -544,6 +559,8 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
         if limit in ("", JUDGED) and search.ends(known):
             limit = ENDED
         outcome = None if limit else _looked_at(ahead, state, roles)
+        if outcome is not None:
+            search.kept.now()
         outcome = outcome or examine(
             state,
             roles,
@@ -553,6 +570,7 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
             limit=limit,
             ahead=state is not refused and len(state.assembly.steps) + 2 <= max_effects,
             keep_columns=search.keep_columns,
+            before=search.kept.now,
             callback=callback,
         )
         ahead = None if outcome._ahead is None else (outcome._ahead, roles)
@@ -585,7 +603,7 @@ def _rounds(known: Progress, search: SearchOptions) -> Progress:
             roles = replace(roles, measured=noise)
         known = known.after(outcome, state, notes)
         if not _went_no_further(known):  # a longer search goes on with what was on trial
-            search.keep(known)
+            search.kept.later(known)
     return known
 
 

@@ -334,6 +334,7 @@ def score_candidates(
     *,
     order: Callable[[Option, int], int | bool] | None = None,
     keep: Callable[[Scanned], None] | None = None,
+    before: Callable[[], object] = lambda: None,
     callback: ProgressCallback = lambda _: None,
 ) -> tuple[list[Score], dict[str, str]]:
     """Score every effect at every place, each effect once.
@@ -353,6 +354,8 @@ def score_candidates(
         catalogue. Their shares are equal but for round-off, which differs between machines.
     keep : callable, optional
         Receives what the candidates change in the outputs, unless that is large.
+    before : callable, optional
+        What this process does first, while others score.
     callback : callable, optional
         Receives a message at each step.
 
@@ -373,10 +376,10 @@ def score_candidates(
     options = [one for one, reason in zip(options, reasons, strict=True) if reason is None]
     callback(f"score {number_of(len(options), 'candidate')}")
     if keep is not None and size_of(base.fit, options) <= MOST_KEPT:
-        scores, failed, columns = score_and_keep(base, options, jobs)
+        scores, failed, columns = score_and_keep(base, options, jobs, before)
         keep(Scanned(base.fit, assembly, effects, options, columns))
     else:
-        scores, failed = score_all(base, options, jobs)
+        scores, failed = score_all(base, options, jobs, before)
     places = {option.key: k for k, option in enumerate(options)}
     chosen = order or (lambda _, place: place)
     scores.sort(key=lambda score: chosen(score.option, places[score.option.key]))

@@ -6,7 +6,7 @@ progress holds everything that the search needs to continue after its last finis
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -84,6 +84,7 @@ def examine(
     limit: str = "",
     ahead: bool = False,
     keep_columns: bool = False,
+    before: Callable[[], object] = lambda: None,
     callback: ProgressCallback,
 ) -> Round:
     """Look for the effect that a fitted model lacks.
@@ -107,6 +108,8 @@ def examine(
         cause.
     keep_columns : bool
         Whether a round that accepts no effect keeps what the candidates change in the outputs.
+    before : callable
+        What this process does first, while others score candidates.
     callback : callable
         Receives a message at each step.
     """
@@ -120,6 +123,7 @@ def examine(
         effects,
         numerics.jobs,
         keep=kept.append if keep_columns else None,
+        before=before,
         callback=callback,
     )
     scanned = kept[0] if kept else None

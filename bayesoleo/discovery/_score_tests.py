@@ -14,7 +14,7 @@ candidates, and candidates that the data cannot distinguish are grouped.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
@@ -243,9 +243,12 @@ class Score:
 
 
 def score_all(
-    base: Base, options: Sequence[Option], jobs: int | None = None
+    base: Base,
+    options: Sequence[Option],
+    jobs: int | None = None,
+    before: Callable[[], object] = lambda: None,
 ) -> tuple[list[Score], dict[str, str]]:
-    """Score every candidate.
+    """Score every candidate; ``before`` as of :func:`process_map`.
 
     Returns
     -------
@@ -255,15 +258,19 @@ def score_all(
         Reason by effect where the extended model could not be solved.
     """
     cost = partial(cost_of, base.fit)
-    return _of_results(process_map(_apart, base, options, jobs, cost=cost), options)
+    found = process_map(_apart, base, options, jobs, before=before, cost=cost)
+    return _of_results(found, options)
 
 
 def score_and_keep(
-    base: Base, options: Sequence[Option], jobs: int | None = None
+    base: Base,
+    options: Sequence[Option],
+    jobs: int | None = None,
+    before: Callable[[], object] = lambda: None,
 ) -> tuple[list[Score], dict[str, str], list[list[Block] | Status]]:
     """The same with the columns of each option, by set of shapes, or why there are none."""
     cost = partial(cost_of, base.fit)
-    found = process_map(_apart_with_columns, base, options, jobs, cost=cost)
+    found = process_map(_apart_with_columns, base, options, jobs, before=before, cost=cost)
     scores, failed = _of_results([result for _, result in found], options)
     return scores, failed, [columns for columns, _ in found]
 

@@ -14,6 +14,7 @@ from bayesoleo.discovery import _refit as refits, _review as review
 from bayesoleo.discovery._alternatives import followed, leads_as_far
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._fit_difference import Undecided
+from bayesoleo.discovery._kept_progress import Kept
 from bayesoleo.discovery._loop import SearchOptions, close_loop, searched
 from bayesoleo.discovery._nonparametric_round import (
     _several_in_one_balance,
@@ -188,7 +189,7 @@ def test_another_first_effect_is_followed_only_where_it_leads_as_far(tmp_path):
 
 def begun_with_two(begun, roles):
     """A search that went on from its first effect."""
-    search = SearchOptions(roles, NUMERICS, EFFECTS, 0, 2, False, lambda _: None, lambda _: None)
+    search = SearchOptions(roles, NUMERICS, EFFECTS, 0, 2, False, Kept(), lambda _: None)
     found = searched(begun, search)
     assert set(found.state.assembly.added) == {
         ("cubic_stiffness", "force"), ("coulomb_friction", "force")

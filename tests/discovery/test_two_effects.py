@@ -11,6 +11,7 @@ from fitted_states import NUMERICS
 from bayesoleo.discovery import _loop as loop, _two_effects as two_effects
 from bayesoleo.discovery._assembly import Roles
 from bayesoleo.discovery._hold_out_confirmation import Fall
+from bayesoleo.discovery._kept_progress import Kept
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.discovery._round import JUDGED, Progress, Round
 
@@ -193,7 +194,7 @@ def test_an_effect_on_trial_is_taken_back_where_no_other_one_is_confirmed(monkey
     monkeypatch.setattr(loop, "_limit", lambda *_: "")
     monkeypatch.setattr(loop, "judged_together", lambda one, *_: one)
     search = loop.SearchOptions(
-        Roles((), (), "declared", ""), NUMERICS, None, 0, 4, False, lambda _: None, str
+        Roles((), (), "declared", ""), NUMERICS, None, 0, 4, False, Kept(), str
     )
     found = loop._rounds(Progress(declared, declared), search)
     assert looks == [
@@ -233,7 +234,7 @@ def test_what_is_not_confirmed_beside_the_others_goes_and_is_not_sought_again(mo
     monkeypatch.setattr(loop, "_limit", lambda *_: "")
     monkeypatch.setattr(loop, "judged_together", together)
     roles = Roles((), (), "declared", "")
-    search = loop.SearchOptions(roles, NUMERICS, None, 0, 4, False, lambda _: None, str)
+    search = loop.SearchOptions(roles, NUMERICS, None, 0, 4, False, Kept(), str)
     found = loop._rounds(Progress(declared, declared), search)
     assert looks == [("declared", ""), ("two", ""), ("one", JUDGED)]
     assert found.state is with_one

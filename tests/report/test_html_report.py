@@ -19,6 +19,13 @@ import bayesoleo._worker_processes as processes
 from bayesoleo import _schema as schema
 from bayesoleo._report import sections
 from bayesoleo._report.page import render_report, write_report
+from bayesoleo._report.page_figures import (
+    LARGEST,
+    _drawn_ahead,
+    draw_ahead,
+    parts_of_draws,
+    shared_by,
+)
 from bayesoleo._report.sections import Image, encode_formula
 from bayesoleo._report.sentences import headline, reason, runs_used
 from bayesoleo._report.tables import (
@@ -428,3 +435,51 @@ def test_figures_of_another_process_are_the_same(oleo, page, monkeypatch):
     monkeypatch.setenv("BAYESOLEO_PROCESSES", "0")
     with matplotlib.rc_context({"axes.titleweight": "bold"}):
         assert render_report(oleo) == mixed != page
+
+
+class Drawing:
+    """Another process that has drawn some figures, and ends with those that it is asked for."""
+
+    def __init__(self, tree, there, here=()):
+        shared = shared_by(tree)
+        self._there = dict(draw_ahead(shared, part) for part in there)
+        self.drawn = {part: ["drawn here before"] for part in here}
+        self.asked, self.looks, self.goes_on = [], [], True
+
+    def end_with(self, tree, part):
+        self.asked.append(part)
+        self._there |= dict([draw_ahead(shared_by(tree), part)])
+
+    def pictures(self):
+        self.goes_on = False
+        return {**self._there, **self.drawn}
+
+
+def test_the_largest_figure_is_asked_for_before_results_are_written(oleo, unpainted):
+    order, ahead = [], Drawing(oleo, [("data", 0)])
+    ends = ahead.end_with
+    ahead.end_with = lambda *given: (order.append("largest"), ends(*given))
+    found = _drawn_ahead(oleo, lambda: order.append("written"), ahead)
+    assert order == ["largest", "written"]
+    assert ahead.asked == [LARGEST]
+    assert set(found) == {("data", 0), *parts_of_draws(oleo)}
+    shared = shared_by(oleo)
+    assert all(draw_ahead(shared, part) == (part, figures) for part, figures in found.items())
+
+
+def test_figures_are_drawn_here_only_while_another_process_draws(oleo, unpainted):
+    ahead = Drawing(oleo, [])
+
+    def written():
+        ahead.goes_on = False
+
+    assert set(_drawn_ahead(oleo, written, ahead)) == {LARGEST}
+
+
+def test_what_was_drawn_before_is_not_drawn_again(oleo, unpainted):
+    before = [LARGEST, ("trace", 0)]
+    ahead = Drawing(oleo, [], here=before)
+    found = _drawn_ahead(oleo, lambda: None, ahead)
+    assert ahead.asked == []
+    assert [found[part] for part in before] == [["drawn here before"]] * 2
+    assert set(found) == set(parts_of_draws(oleo))

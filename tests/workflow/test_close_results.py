@@ -22,7 +22,7 @@ from bayesoleo._worker_processes import Beside
 from bayesoleo._workflow import closing, structures_beside
 from bayesoleo._workflow.predicting import predict
 from bayesoleo._workflow.settings import Settings
-from bayesoleo._workflow.structures_beside import pictures_meanwhile
+from bayesoleo._workflow.structures_beside import DrawnAhead, pictures_meanwhile
 from bayesoleo.assessment import assess
 from bayesoleo.effects import find_effect
 from bayesoleo.errors import BayesoleoError, InputError
@@ -242,11 +242,11 @@ def test_figures_drawn_ahead_are_those_of_the_result(closed, campaign, tmp_path,
     monkeypatch.setattr(closing, "WORTH_KEEPING", math.inf)  # however slow the machine is
     # Of so few parameters, those of an added effect are shown: a tree has to know them.
     monkeypatch.setattr(_posterior, "CORNER_MOST", 1)
-    rightly, drawn = closing.pictures_of, {}
+    rightly, drawn = DrawnAhead.pictures, {}
 
-    def whole(beside):
-        beside._thread.join()  # until it has drawn all
-        drawn.update(rightly(beside))
+    def whole(ahead):
+        ahead.beside._thread.join()  # until it has drawn all
+        drawn.update(rightly(ahead))
         return drawn
 
     def all_here(beside, tree):
@@ -255,7 +255,7 @@ def test_figures_drawn_ahead_are_those_of_the_result(closed, campaign, tmp_path,
         return found
 
     monkeypatch.setattr(Beside, "answered", False)  # whatever is waited for takes as long
-    monkeypatch.setattr(closing, "pictures_of", whole)
+    monkeypatch.setattr(DrawnAhead, "pictures", whole)
     monkeypatch.setattr(closing, "pictures_meanwhile", all_here)
     tree = workflow.close(campaign, MODEL, replace(SETTINGS, jobs=2), out=tmp_path)
     assert set(drawn) == {*parts_ahead(tree), *parts_of_draws(tree)}
