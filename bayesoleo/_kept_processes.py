@@ -39,8 +39,10 @@ SELDOM = 200_000, 10, 10
 #: At its own values arrays of a megabyte get new pages, which are filled with zeros, again and
 #: again: a third of all page faults of a command, half a second.
 MMAP_THRESHOLD, TRIM_THRESHOLD = (-3, 2**25), (-1, 2**28)
-#: Bytes that a pipe holds, where the system lets it: messages have megabytes.
-PIPE = 2**20
+#: Bytes that a pipe is to hold: messages have megabytes. All pipes of a user may hold 64 MiB.
+PIPE = 2**18
+#: Seconds without work after which a process gives back the memory that it keeps.
+RESTING = 5.0
 #: It finds modules where its parent finds them, and does not run the user's script again.
 _CHILD = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]);"
@@ -74,8 +76,8 @@ class Worker:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             env=environment,
-            pipesize=PIPE,
         )
+        _widen(self.process.stdin, self.process.stdout)
 
     def ask(self, message: Message, known: Sequence[Any] = ()) -> tuple[str, Any]:
         """Send a message and wait for the answer: its kind and its content."""
@@ -109,6 +111,15 @@ class Worker:
                 with suppress(OSError):
                     pipe.close()
         self.process.wait()
+
+
+def _widen(*pipes: Any) -> None:
+    """Let pipes hold more, where the system does that and has not given too much to others."""
+    with suppress(ImportError, AttributeError, OSError):
+        import fcntl
+
+        for pipe in pipes:
+            fcntl.fcntl(pipe.fileno(), fcntl.F_SETPIPE_SZ, PIPE)
 
 
 def content_of(answer: Message, known: Sequence[Any] = ()) -> tuple[str, Any]:
@@ -237,8 +248,14 @@ def keep_memory() -> None:
     """Keep memory that arrays have left for the next ones, where the C library can be told so."""
     with suppress(OSError, AttributeError, TypeError):
         set_option = ctypes.CDLL(None).mallopt
-        for option, value in (MMAP_THRESHOLD, TRIM_THRESHOLD):
-            set_option(option, value)
+        # Either alone ends the library's own choice of both.
+        _ = set_option(*MMAP_THRESHOLD) and set_option(*TRIM_THRESHOLD)
+
+
+def give_back_memory() -> None:
+    """Give all memory that nothing is in back to the system, where the C library can do that."""
+    with suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def serve(modules: Sequence[str]) -> None:
@@ -295,7 +312,10 @@ def _waits(source: BinaryIO) -> bool:
     """Whether something comes before it has been idle for too long."""
     if sys.platform == "win32":
         return True  # pipes cannot be waited for
-    return bool(select.select([source], [], [], IDLE)[0])
+    if select.select([source], [], [], RESTING)[0]:
+        return True
+    give_back_memory()
+    return bool(select.select([source], [], [], IDLE - RESTING)[0])
 
 
 def _of_error(error: Exception) -> Message:

@@ -7,10 +7,11 @@ import pickle
 import struct
 import sys
 from collections.abc import Sequence
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 #: A message: a pickle, and the memory of its large arrays, which is not copied into it.
 type Message = list[memoryview | bytes | bytearray | NDArray[np.uint8]]
@@ -105,6 +106,8 @@ def _number(pipe: BinaryIO) -> int | None:
 
 def _filled(pipe: BinaryIO, size: int) -> NDArray[np.uint8] | None:
     """So many bytes, which an array may take for its own memory; None where the pipe ends."""
+    import numpy as np  # a command first starts a process, and loads libraries then
+
     part, at = np.empty(size, np.uint8), 0  # bytes of Python's would be filled with zeros first
     while at < size:
         got = pipe.readinto(memoryview(part)[at:])  # type: ignore[attr-defined]

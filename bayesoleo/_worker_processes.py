@@ -115,6 +115,7 @@ def _shared[S, T, R](
         helper.start()
     try:
         before()
+        call.begin()
         call.work()
     except BaseException:
         kill_processes()  # nobody waits for what they are doing
@@ -164,7 +165,7 @@ class _Call:
         self.found: dict[int, Any] = {}
         self.failed: BaseException | None = None
         self.lock, self.over = threading.Lock(), threading.Event()
-        self.begun, self.stopped = time.perf_counter(), False
+        self.begun, self.stopped, self.working = time.perf_counter(), False, False
         self._sent: Message = []
 
     def _take(self, last: bool, leaving: int = 0) -> int | None:
@@ -177,6 +178,10 @@ class _Call:
         with self.lock:
             if not self.stopped:  # else nobody wants it any more
                 self.left.appendleft(index)
+
+    def begin(self) -> None:
+        """Say that items are done here from now on: their time is known then."""
+        self.begun, self.working = time.perf_counter(), True
 
     def work(self) -> None:
         """Do items here until none is left and those of other processes have come."""
@@ -252,8 +257,11 @@ class _Call:
             self.over.set()
 
     def _worth(self, number: int) -> bool:
-        """Whether the work that is left is worth another process, by the time of that done."""
+        """Whether the work that is left is worth another process, by the time of that done; one
+        that runs need not wait until some is."""
         took = time.perf_counter() - self.begun
+        if not self.working:
+            return number in kept and took > LOOK
         each = took / max(len(self.found), 1)
         least = WORTH_ASKING if number in kept else WORTH_STARTING
         return took > LOOK and each * len(self.left) > least
@@ -391,7 +399,8 @@ class Beside[S, R]:
         self._function, self._message, self._more = function, message, list[Message]()
         self._found: list[tuple[str, Any]] = []
         self._items: dict[int, Any] = {}
-        self._last, self._over, self._lock = list[Message](), False, threading.Lock()
+        self._last, self._open, self._over = list[Message](), True, False
+        self._lock = threading.Lock()
         self._answered, self._enough = threading.Event(), threading.Event()
         self._dropped = False
         self._freed = threading.Lock()
@@ -467,9 +476,11 @@ class Beside[S, R]:
         LostError
             If they cannot be sent.
         """
+        if not self._open:
+            return
         messages = _messages_of(function, shared, [item])
         with self._lock:
-            if not self._over:
+            if self._open:
                 self._last[:] = messages
         self._enough.set()
 
@@ -514,7 +525,7 @@ class Beside[S, R]:
             forget(0)
         finally:
             self._answered.set()
-            self._over = True
+            self._open, self._over = False, True
             self._free()
 
     def _go_on(self, worker: Worker) -> None:
@@ -523,8 +534,9 @@ class Beside[S, R]:
                 break
             self._done(worker, message, number)
         with self._lock:
-            self._over = not self._last
-        for number, message in enumerate(self._last, len(self._more)):
+            self._open, last = False, list(self._last)
+        self._over = not last
+        for number, message in enumerate(last, len(self._more)):
             self._done(worker, message, number)
 
     def _done(self, worker: Worker, message: Message, number: int) -> None:

@@ -128,6 +128,44 @@ def test_where_the_library_cannot_be_told_nothing_happens(monkeypatch, library):
 
     monkeypatch.setattr(kept_processes.ctypes, "CDLL", opened)
     kept_processes.keep_memory()
+    kept_processes.give_back_memory()
+
+
+def test_a_process_serves_where_its_pipes_cannot_be_widened(eager, monkeypatch, tmp_path):
+    """A user's pipes may hold 64 MiB together, and the system may allow less of one."""
+    fcntl = pytest.importorskip("fcntl")
+
+    def refused(*_):
+        raise PermissionError(1, "Operation not permitted")
+
+    kept_processes.end_processes()
+    monkeypatch.setattr(fcntl, "fcntl", refused)
+    found = process_map(square_in_company, tmp_path, range(12), 2)
+    assert len({number for number, _ in found}) == 2
+
+
+def test_short_work_after_something_long_starts_no_process(monkeypatch):
+    kept_processes.end_processes()
+    monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
+    found = process_map(shifted, 1, range(200), 3, before=lambda: time.sleep(0.3))
+    assert {number for number, _ in found} == {os.getpid()}
+    assert not kept_processes.kept
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes cannot be waited for")
+def test_a_process_that_rests_gives_back_its_memory(monkeypatch):
+    calls = []
+    monkeypatch.setattr(kept_processes, "RESTING", 0.05)
+    monkeypatch.setattr(kept_processes, "IDLE", 0.1)
+    monkeypatch.setattr(kept_processes, "give_back_memory", lambda: calls.append("given back"))
+    source, target = os.pipe()
+    with os.fdopen(source, "rb") as stream:
+        assert not kept_processes._waits(stream)
+        assert calls == ["given back"]
+        os.write(target, b"something")
+        assert kept_processes._waits(stream)
+        assert calls == ["given back"]
+    os.close(target)
 
 
 def test_short_work_starts_no_process(monkeypatch):

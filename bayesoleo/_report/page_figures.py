@@ -35,12 +35,15 @@ def figures_of(
     ahead: Ahead | None,
 ) -> dict[str, list[Any]]:
     """All that is drawn, by its place on the page; in several processes."""
-    known = {} if ahead is None else _drawn_ahead(tree, before, ahead)
+    known, first = dict[Part, list[Any]](), before
+    if ahead is not None and ahead.goes_on:
+        known, first = _drawn_ahead(tree, before, ahead), lambda: None
+    elif ahead is not None:
+        known |= ahead.pictures()
     makers = _makers(summary)
     every = _parts(tree, makers, drawing)
     left = [part for part in every if part not in known]
     items = [(*makers[kind], number) for kind, number in left]
-    first = before if ahead is None else lambda: None
     found = process_map(_draw, shared_by(tree), items, before=first)
     said = [*drawing.failed, *(text for _, failed in found for text in failed)]
     drawing.failed = list(dict.fromkeys(said))  # what fails of several figures, once
@@ -71,8 +74,8 @@ class Ahead(Protocol):
 def _drawn_ahead(
     tree: xr.DataTree, before: Callable[[], object], ahead: Ahead
 ) -> dict[Part, list[Any]]:
-    """What another process has drawn. While it draws the largest figure, results are written here,
-    and other figures of the draws are drawn."""
+    """What another process draws, and figures of the draws that are drawn here meanwhile. It ends
+    with the largest one, and results are written here first."""
     here, shared = dict[Part, list[Any]](), shared_by(tree)
     others = [part for part in parts_of_draws(tree) if part not in ahead.drawn]
     if LARGEST in others:
@@ -131,8 +134,8 @@ def draw_ahead(
 def _makers(summary: dict[str, Any]) -> dict[str, tuple[str, Maker]]:
     """What is drawn in words, and the function that draws it.
 
-    Processes take them from both ends, so that what takes longest stands there. What another one
-    takes while it draws the largest figure, the last, waits for that: little stands before it.
+    Processes take them from both ends, so that what takes longest stands there, and the largest is
+    the last. The one before it, which waits for whoever draws that, is small.
     """
     first, last = ("residual", "fit", "where"), ("viewer", "formulas", "response", "data")
     makers: dict[str, tuple[str, Maker]] = {

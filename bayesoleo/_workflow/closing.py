@@ -107,10 +107,9 @@ def close(
     """Close the loop: estimate, find what is missing, add it, sample the posterior, compare before
     and after.
 
-    The estimate and each round are kept when they are known, where other processes help as soon as
-    these work on what comes next: the same call, with the same campaign, model and settings, goes
-    on after the last finished round. While the search goes on, its result so far is written as
-    well, once a minute at most.
+    The estimate and each round are kept as the work that follows them begins: the same call, with
+    the same campaign, model and settings, goes on after the last one. While the search goes on,
+    its result so far is written as well, once a minute at most.
 
     Parameters
     ----------

@@ -9,26 +9,26 @@ from bayesoleo.discovery._round import Progress
 
 
 class Kept:
-    """How far a search has come, kept when it is known, or as soon as other processes work as well:
-    to keep it takes as long as several scores, and they would wait.
+    """Keeps how far a search has come as the work that follows begins: other processes, where there
+    are some, do theirs meanwhile, and would wait for as long as several scores take.
 
-    What is left is kept on leaving, by an exception too.
+    What has not been kept is kept on leaving, by an exception too.
 
     Parameters
     ----------
     keep : callable
-        Receives it.
+        Receives the progress.
     """
 
     def __init__(self, keep: Callable[[Progress], object] = lambda _: None) -> None:
         self._keep, self._left = keep, list[Progress]()
 
     def later(self, known: Progress) -> None:
-        """Keep it at the next :meth:`now`; it holds what was left before."""
+        """Keep this progress at the next :meth:`now`, in place of an earlier one."""
         self._left[:] = [known]
 
     def now(self) -> None:
-        """Keep what is left."""
+        """Keep what has not been kept."""
         while self._left:
             self._keep(self._left.pop())
 

@@ -535,11 +535,15 @@ def searched(known: Progress, search: SearchOptions) -> Progress:
         known = _rounds(known, search)
         if _went_no_further(known):
             break
-        if len(known.state.assembly.steps) > 1:  # else there is nothing to be reviewed
-            search.kept.now()
         roles = _with_noise(search.roles, known)
         known = reviewed(
-            known, roles, search.numerics, search.effects, search.callback, replacing=left > 0
+            known,
+            roles,
+            search.numerics,
+            search.effects,
+            search.callback,
+            replacing=left > 0,
+            before=search.kept.now,
         )
         if known.finished:
             break

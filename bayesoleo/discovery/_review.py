@@ -8,7 +8,7 @@ the comparison. A candidate that does better beside the others replaces the effe
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -116,6 +116,7 @@ def reviewed(
     callback: ProgressCallback,
     *,
     replacing: bool = True,
+    before: Callable[[], object] = lambda: None,
 ) -> Progress:
     """Review the final effects of a finished search, each beside the others.
 
@@ -131,6 +132,8 @@ def reviewed(
         Receives a message at each step.
     replacing : bool
         Whether an effect may be replaced by one that does better.
+    before : callable
+        Called before any work.
 
     Returns
     -------
@@ -146,6 +149,7 @@ def reviewed(
         accepted = progress.rounds[number].accepted
         if curve and (accepted is None or not accepted.same):
             continue  # beside a curve no effect is replaced, and only known rivals are estimated
+        before()
         callback(f"review the alternatives to {step.effect.id}")
         place = place_of(progress, step, number, roles, numerics, effects, only_known=curve)
         if place is None:
@@ -155,7 +159,10 @@ def reviewed(
             if found is not None:
                 return found
         progress = _with_class(progress, place)
-    return progress if curve or not replacing else _smaller(progress, roles, numerics, callback)
+    if curve or not replacing or len(progress.state.assembly.steps) < 2:
+        return progress
+    before()
+    return _smaller(progress, roles, numerics, callback)
 
 
 def _smaller(
@@ -167,8 +174,6 @@ def _smaller(
     needed, whereas the true effect in place of the first needs no companion.
     """
     steps = progress.state.assembly.steps
-    if len(steps) < 2:
-        return progress
     fitted = replace(roles, held_out=(), strategy="none")
     for step in steps:
         for result, gap in _close_rivals(progress, step):

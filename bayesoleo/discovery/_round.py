@@ -115,6 +115,7 @@ def examine(
     """
     if limit and any(step.effect.family == FAMILY for step in state.assembly.steps):
         # A curve absorbs the share of named effects, so that a ranking of them is meaningless.
+        before()
         return Round(state, (), {}, None, None, limit, 1.0)
     base, policy, kept = state.base(), numerics.policy, list[Scanned]()
     scores, failed = score_candidates(

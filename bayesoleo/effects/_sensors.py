@@ -33,6 +33,7 @@ from bayesoleo.model._expressions import (
     TIME,
     WITHIN,
     derivative_symbol,
+    extreme,
     split_derivative,
     symbol,
     total_derivative,
@@ -413,7 +414,7 @@ def _saturation(side: str) -> Effect:
     def saturate(model: Model, channel: str, names: Names) -> Model:
         whole = sp.Add(*model.output_terms(channel).values())
         inside = names["extreme"] - names["depth"] if upper else names["extreme"] + names["depth"]
-        beyond = sp.Max(whole - inside, 0) if upper else sp.Min(whole - inside, 0)
+        beyond = extreme(sp.Max if upper else sp.Min, whole - inside, sp.Integer(0))
         return model.with_term("output", channel, id_, -names[id_] * beyond)
 
     beyond_level = (

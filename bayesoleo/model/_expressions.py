@@ -12,7 +12,7 @@ import operator
 import re
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache, lru_cache
-from typing import cast
+from typing import Any, cast
 
 import sympy as sp
 from sympy.printing.str import StrPrinter
@@ -99,7 +99,7 @@ FUNCTIONS: dict[str, object] = {
     "tanh": sp.tanh,
     "min": sp.Min,
     "max": sp.Max,
-    "positive": lambda x: sp.Max(x, 0),
+    "positive": lambda x: extreme(sp.Max, x, sp.Integer(0)),
     "bspline": bspline,
     "bspline_slope": bspline_slope,
     "step": lambda x: sp.Heaviside(x, sp.Rational(1, 2)),
@@ -157,7 +157,7 @@ def with_symbol_as(expression: sp.Expr, item: sp.Symbol, body: sp.Expr) -> sp.Ex
 
 @lru_cache(maxsize=20_000)
 def _with_symbol(expression: sp.Expr, item: sp.Symbol, body: sp.Expr) -> sp.Expr:
-    return expression.xreplace({item: body})
+    return _rebuilt(expression, {item: body}, extreme)
 
 
 def with_symbols_as(expression: sp.Expr, table: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
@@ -170,15 +170,43 @@ def with_symbols_as(expression: sp.Expr, table: Mapping[sp.Symbol, sp.Expr]) -> 
 
 @lru_cache(maxsize=2_000)
 def _with_symbols(expression: sp.Expr, items: frozenset[tuple[sp.Symbol, sp.Expr]]) -> sp.Expr:
-    return _rebuilt(expression, dict(items))
+    return _rebuilt(expression, dict(items), _as_different)
 
 
-def _rebuilt(expression: sp.Expr, table: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
-    """The expression with symbols replaced.
+def extreme(kind: Any, *arguments: sp.Expr) -> sp.Expr:
+    """The largest or the smallest of several.
 
-    The arguments of a maximum stay as different as they are: to compare them anew takes most of the
-    time that SymPy's own replacement does.
+    SymPy compares them in their factored form as well, which takes longer than all else that is
+    done to most effects. Beside zero that is left out where the sign of the other one is unknown.
+
+    Parameters
+    ----------
+    kind : {sympy.Max, sympy.Min}
+    *arguments : Expr
     """
+    others = [one for one in arguments if not one.is_zero]
+    unknown = len(others) == 1 and len(arguments) == 2 and _has_no_sign(others[0])
+    return cast(sp.Expr, kind(*arguments, evaluate=not unknown))
+
+
+def _has_no_sign(expression: sp.Expr) -> bool:
+    """Whether SymPy does not know on which side of zero it is; of an extreme it may find that."""
+    above, below = expression.is_extended_nonnegative, expression.is_extended_nonpositive
+    return above is None and below is None and not isinstance(expression, sp.Max | sp.Min)
+
+
+def _as_different(kind: Any, *arguments: sp.Expr) -> sp.Expr:
+    """The largest or the smallest of several that stay as different as they were: to compare them
+    anew takes most of the time that SymPy's own replacement does."""
+    return cast(sp.Expr, kind(*arguments, evaluate=False))
+
+
+def _rebuilt(
+    expression: sp.Expr,
+    table: Mapping[sp.Symbol, sp.Expr],
+    extreme_of: Callable[..., sp.Expr],
+) -> sp.Expr:
+    """The expression with symbols replaced."""
     done: dict[sp.Basic, sp.Basic] = {}
 
     def made(part: sp.Basic) -> sp.Basic:
@@ -187,8 +215,12 @@ def _rebuilt(expression: sp.Expr, table: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr
         if part not in done:
             arguments = [made(argument) for argument in part.args]
             same = all(map(operator.is_, arguments, part.args))
-            plain = {"evaluate": False} if isinstance(part, sp.Max | sp.Min) else {}
-            done[part] = part if same else part.func(*arguments, **plain)
+            if same:
+                done[part] = part
+            elif isinstance(part, sp.Max | sp.Min):
+                done[part] = extreme_of(part.func, *arguments)
+            else:
+                done[part] = part.func(*arguments)
         return done[part]
 
     return cast(sp.Expr, made(expression))
@@ -375,6 +407,8 @@ class _Builder(ast.NodeVisitor):
         if len(arguments) < least or (least == 1 and len(arguments) > 1):
             wanted = "two arguments or more" if least == 2 else "one argument"
             raise ModelError(f"{self.where}: {name} takes {wanted}", value=self.text)
+        if function in (sp.Max, sp.Min):
+            return extreme(function, *arguments)
         return function(*arguments)
 
     def _time_derivative(self, argument: ast.expr, order: int) -> sp.Expr:

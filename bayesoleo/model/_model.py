@@ -50,6 +50,19 @@ def _slope(term: sp.Expr, moving: sp.Symbol, numbers: frozenset[tuple[sp.Symbol,
     return change.real if cmath.isfinite(change) and change.imag == 0 else 0.0
 
 
+@lru_cache(maxsize=20_000)
+def _expanded(term: sp.Expr, table: tuple[tuple[sp.Symbol, sp.Expr], ...]) -> sp.Expr:
+    """A term with the names of definitions replaced by what stands behind them. Models of a search
+    share most of their terms and definitions."""
+    # One pass is enough for names declared in order; an effect may refer to a later one.
+    for _ in range(len(table)):
+        for item, body in reversed(table):
+            term = with_symbol_as(term, item, body)
+        if symbols_of(term).isdisjoint(item for item, _ in table):
+            break
+    return term
+
+
 @dataclass(frozen=True)
 class Model:
     """Equations of motion and outputs as sums of named terms.
@@ -251,14 +264,10 @@ class Model:
 
     def expand(self, expression: sp.Expr) -> sp.Expr:
         """Replace the names of definitions by what stands behind them."""
-        table = {symbol(name): body for name, body in self.definitions.items()}
-        # One pass is enough for names declared in order; an effect may refer to a later one.
-        for _ in range(len(table)):
-            for item in reversed(table):
-                expression = with_symbol_as(expression, item, table[item])
-            if symbols_of(expression).isdisjoint(table):
-                break
-        return expression
+        table = tuple((symbol(name), body) for name, body in self.definitions.items())
+        if not table:
+            return expression
+        return sp.Add(*(_expanded(term, table) for term in sp.Add.make_args(expression)))
 
     @cached_property
     def _expanded(self) -> dict[tuple[str, str], sp.Expr]:

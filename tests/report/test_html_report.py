@@ -483,3 +483,15 @@ def test_what_was_drawn_before_is_not_drawn_again(oleo, unpainted):
     assert ahead.asked == []
     assert [found[part] for part in before] == [["drawn here before"]] * 2
     assert set(found) == set(parts_of_draws(oleo))
+
+
+@pytest.mark.parametrize("goes_on", [True, False])
+def test_results_are_written_once_before_a_page(oleo, unpainted, tmp_path, goes_on):
+    calls, ahead = [], Drawing(oleo, [("data", 0)])
+    ahead.goes_on = goes_on
+    write_report(oleo, tmp_path / "report.html", lambda: calls.append("written"), ahead)
+    assert calls == ["written"]
+    assert ahead.asked == [LARGEST] * goes_on
+    alone = tmp_path / "alone.html"
+    write_report(oleo, alone)
+    assert (tmp_path / "report.html").read_text("utf-8") == alone.read_text("utf-8")
