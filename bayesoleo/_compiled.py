@@ -30,6 +30,7 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
 
 from bayesoleo._compiled_sources import stamp_of
+from bayesoleo._linked_code import LinkedCompiler
 from bayesoleo._machine_code import COMPILING, address_of, sealed, unsealed, write_durably
 from bayesoleo._one_compilation import in_one_process, is_elsewhere
 from bayesoleo._types import Array, Integers
@@ -229,15 +230,15 @@ def cached[F: Callable[..., Any]](**options: Any) -> Callable[[F], F]:
 #: Compiles a function for other compiled code and for Python, without the interpreter lock. C calls
 #: none of them.
 jit = cached(error_model="numpy", no_cfunc_wrapper=True)
-#: The same for a function that only compiled code calls. A wrapper unpacks every argument that
-#: Python may give; where these are arrays it can take longer to compile than what it wraps. Without
-#: one, a call by Python ends the process.
-inner = cached(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
-#: The same for a function that others call in one place or two: its instructions become theirs. The
-#: compiler makes machine code of each function and then once more of all that calls it, so that a
-#: chain of calls costs a multiple.
-inlined = cached(error_model="numpy", inline="always")
-
+#: The same for a function that only compiled code calls: its instructions become those of callers.
+#: A wrapper unpacks every argument that Python may give; where these are arrays it can take longer
+#: to compile than what it wraps. Without one, a call by Python ends the process.
+inner = cached(
+    error_model="numpy",
+    no_cpython_wrapper=True,
+    no_cfunc_wrapper=True,
+    pipeline_class=LinkedCompiler,
+)
 #: Points in a block, and the distance between rows.
 BLOCK = 64
 

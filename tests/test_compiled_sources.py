@@ -41,9 +41,9 @@ FILES = {
             return added(x)
     """,
     "callee.py": """
-        from bayesoleo._compiled import inlined
+        from bayesoleo._compiled import inner
 
-        @inlined
+        @inner
         def added(x):
             return x + 1.0
     """,

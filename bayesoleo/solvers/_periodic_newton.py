@@ -25,7 +25,6 @@ from bayesoleo._compiled import (
     after,
     call_kernel,
     caller,
-    inlined,
     inner,
     integers,
     jit,
@@ -156,7 +155,7 @@ def evaluate(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work) -> in
     return NEEDS_EXCHANGE if bad > 0 else CONVERGED
 
 
-@inlined
+@inner
 def evaluate_again(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work) -> bool:
     """Equations alone at the present unknowns, solved with the last derivatives; whether the
     unknowns are admissible."""
@@ -215,7 +214,7 @@ def _silence(sizes: Sizes, sweep: Sweep, b: int, count: int, work: Work) -> None
                     z[k, stage * steps + i] = 0.0
 
 
-@inlined
+@inner
 def close(pieces: SweepKernels, sizes: Sizes, work: Work) -> int:
     """Invert the closure of the period, from the recursion's matrices alone."""
     D, products = sizes.state, numbers(work.products)
@@ -242,7 +241,7 @@ def _set_identity(matrix: Array) -> None:
             matrix[i, k] = 1.0 if i == k else 0.0
 
 
-@inlined
+@inner
 def start_chunks(pieces: SweepKernels, sizes: Sizes, work: Work, initial: bool) -> None:
     """First state of every chunk: that of the period from its closure, or zero."""
     history, whole, rest = numbers(work.history), sizes.steps // WIDTH, sizes.steps % WIDTH
@@ -350,7 +349,7 @@ def _extrapolate(line: LinearStart, lane: int, sizes: Sizes, now: int) -> None:
             to[i] += first * a[i]
 
 
-@inlined
+@inner
 def _iterate(
     pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, options: Options
 ) -> tuple[int, int]:
@@ -393,7 +392,7 @@ def _iterate(
     return (NO_CONVERGENCE if outcome == CONVERGED else outcome), iteration
 
 
-@inlined
+@inner
 def _chords(
     pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, options: Options, size: float
 ) -> tuple[int, float]:
@@ -424,7 +423,7 @@ def _chords(
     return most, last
 
 
-@inlined
+@inner
 def _chord_suffices(size: float, last: float) -> bool:
     """Whether one more step with these derivatives leaves round-off, if Newton's error is squared:
     ``k size**2`` with ``k = size / last**2``, which old derivatives contract by ``2 k size``.
@@ -433,7 +432,7 @@ def _chord_suffices(size: float, last: float) -> bool:
     return 2.0 * size * ratio**4 < CHORD_LEFT
 
 
-@inlined
+@inner
 def _advance(
     pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, monotone: bool, size: float
 ) -> tuple[int, float, float]:
@@ -461,7 +460,7 @@ def _advance(
     return (INADMISSIBLE if outcome == INADMISSIBLE else NO_CONVERGENCE), fraction, np.inf
 
 
-@inlined
+@inner
 def _step(pieces: SweepKernels, sizes: Sizes, sweep: Sweep, work: Work, initial: bool) -> int:
     """The Newton step at all positions, from the recursion of the last evaluation."""
     outcome = CONVERGED if initial else close(pieces, sizes, work)
@@ -512,7 +511,7 @@ def _largest(values: Any, count: int, level: float, scratch: int) -> float:
     return float(distances[0])
 
 
-@inlined
+@inner
 def _reduces(before: Array, after: Array, d: int) -> tuple[bool, float]:
     """Whether the residual fell, in units of the equations' terms, or is round-off, and its size in
     its own.
