@@ -30,7 +30,7 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
 
 from bayesoleo._compiled_sources import stamp_of
-from bayesoleo._linked_code import LinkedCompiler
+from bayesoleo._linked_code import LinkedCompiler, LinkedTarget, set_environments
 from bayesoleo._machine_code import COMPILING, address_of, sealed, unsealed, write_durably
 from bayesoleo._one_compilation import in_one_process, is_elsewhere
 from bayesoleo._types import Array, Integers
@@ -141,6 +141,7 @@ class _CheckedCache(_FunctionCache):  # type: ignore[misc]
 
     def __init__(self, function: Callable[..., Any], options: Mapping[str, Any]) -> None:
         super().__init__(function)
+        self._is_linked = options.get("pipeline_class") is LinkedCompiler
         self._cache_file = _CheckedFile(
             cache_path=self._cache_path,
             base=self._impl.filename_base,
@@ -160,7 +161,11 @@ class _CheckedCache(_FunctionCache):  # type: ignore[misc]
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """What was compiled before; that something has to be compiled now is told once."""
-        found = super().load_overload(signature, target)
+        if not self._is_linked:
+            found = super().load_overload(signature, target)
+        else:
+            found = super().load_overload(signature, LinkedTarget(target))
+            found = found and found._replace(target_context=target)
         if found is None:
             _tell()
         return found
@@ -200,7 +205,9 @@ def _compiler_of(dispatcher: Any) -> Callable[[Any], Any]:
             _config.OPT = type(before)(min(before, LEVEL))
             _compiling.append(function.__name__)
             try:
-                return compile_one(signature)
+                made = compile_one(signature)
+                set_environments(dispatcher.overloads.values())
+                return made
             finally:
                 _compiling.pop()
                 _config.OPT = before

@@ -2,13 +2,16 @@
 
 Numba optimises every function and makes machine code of it, and once more of all that calls it, in
 which it is contained: a chain of calls costs a multiple. Where only compiled code calls a function,
-its own machine code never runs. Without it, a first run compiles a sixth less.
+its own machine code never runs. Without it, a first run compiles a sixth less. Such functions must
+not call each other in a circle.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
+from llvmlite import binding as llvm
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
@@ -20,8 +23,8 @@ _Lowering: Any = NativeLowering
 _Compiler: Any = CompilerBase
 
 
-class _WithoutEnvironments:
-    """Numba's code generator, but for what it keeps beside machine code."""
+class _LinkedCodegen:
+    """Numba's generator of code, for functions without machine code."""
 
     def __init__(self, codegen: Any) -> None:
         self._codegen = codegen
@@ -30,7 +33,29 @@ class _WithoutEnvironments:
         return getattr(self._codegen, name)
 
     def set_env(self, name: str, env: Any) -> None:
-        """There is no place to keep it in."""
+        """Nothing: callers have the place for it (:func:`set_environments`)."""
+
+    def unserialize_library(self, serialized: tuple[str, str, bytes]) -> LinkedCode:
+        """Instructions that were kept on disk."""
+        name, _, content = serialized
+        library = LinkedCode(self._codegen, name)
+        library._final_module = llvm.parse_bitcode(content)
+        library._finalize_final_module()
+        return library
+
+
+class LinkedTarget:
+    """Numba's target, for reading functions without machine code from disk."""
+
+    def __init__(self, target: Any) -> None:
+        self._target = target
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._target, name)
+
+    def codegen(self) -> _LinkedCodegen:
+        """Its generator of code."""
+        return _LinkedCodegen(self._target.codegen())
 
 
 class LinkedCode(_Library):  # type: ignore[misc]
@@ -39,7 +64,7 @@ class LinkedCode(_Library):  # type: ignore[misc]
     @property
     def codegen(self) -> Any:
         """What generates code for this library."""
-        return _WithoutEnvironments(self._codegen)
+        return _LinkedCodegen(self._codegen)
 
     def _optimize_final_module(self) -> None:
         """Callers optimise what they contain."""
@@ -58,6 +83,20 @@ class LinkedCode(_Library):  # type: ignore[misc]
         """What is kept on disk: the instructions."""
         found: tuple[str, str, bytes] = self.serialize_using_bitcode()
         return found
+
+
+def set_environments(compiled: Iterable[Any]) -> None:
+    """Say to machine code what the functions within it need of Python, such as the text of an error
+    with a value in it. Numba does so where code comes from disk.
+
+    Parameters
+    ----------
+    compiled : iterable of CompileResult
+    """
+    for one in compiled:
+        if not isinstance(one.library, LinkedCode):
+            for environment in one._find_referenced_environments():
+                one.library.codegen.set_env(environment.env_name, environment)
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)

@@ -165,7 +165,8 @@ class _Call:
         self.found: dict[int, Any] = {}
         self.failed: BaseException | None = None
         self.lock, self.over = threading.Lock(), threading.Event()
-        self.begun, self.stopped, self.working = time.perf_counter(), False, False
+        self.begun, self.stopped = time.perf_counter(), False
+        self.working, self.before = False, 0
         self._sent: Message = []
 
     def _take(self, last: bool, leaving: int = 0) -> int | None:
@@ -181,7 +182,8 @@ class _Call:
 
     def begin(self) -> None:
         """Say that items are done here from now on: their time is known then."""
-        self.begun, self.working = time.perf_counter(), True
+        self.begun, self.before = time.perf_counter(), len(self.found)
+        self.working = True
 
     def work(self) -> None:
         """Do items here until none is left and those of other processes have come."""
@@ -257,12 +259,13 @@ class _Call:
             self.over.set()
 
     def _worth(self, number: int) -> bool:
-        """Whether the work that is left is worth another process, by the time of that done; one
-        that runs need not wait until some is."""
+        """Whether the work that is left is worth another process, by the time of that done. Before
+        items are done here, no process is started for them, but one that runs may begin."""
+        working = self.working  # first: it says what the time is counted from
         took = time.perf_counter() - self.begun
-        if not self.working:
+        if not working:
             return number in kept and took > LOOK
-        each = took / max(len(self.found), 1)
+        each = took / max(len(self.found) - self.before, 1)
         least = WORTH_ASKING if number in kept else WORTH_STARTING
         return took > LOOK and each * len(self.left) > least
 

@@ -152,6 +152,20 @@ def test_short_work_after_something_long_starts_no_process(monkeypatch):
     assert not kept_processes.kept
 
 
+def test_the_time_of_items_is_counted_from_the_first_one_done_here(monkeypatch):
+    """Others may have done some before it, in no time of this process."""
+    call = processes._Call(shifted, 1, list(range(130)), lambda _: (), range(130), 2)
+    monkeypatch.setattr(kept_processes, "kept", {})
+    monkeypatch.setattr(processes, "kept", {})
+    call.found = dict.fromkeys(range(30))
+    call.begun -= 10.0
+    assert not call._worth(1)  # nothing is done here yet
+    call.begin()
+    call.found[30] = None
+    call.begun -= 0.35  # its time: some thirty seconds are left
+    assert call._worth(1)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes cannot be waited for")
 def test_a_process_that_rests_gives_back_its_memory(monkeypatch):
     calls = []

@@ -134,8 +134,8 @@ def draw_ahead(
 def _makers(summary: dict[str, Any]) -> dict[str, tuple[str, Maker]]:
     """What is drawn in words, and the function that draws it.
 
-    Processes take them from both ends, so that what takes longest stands there, and the largest is
-    the last. The one before it, which waits for whoever draws that, is small.
+    Processes take them from both ends, so that what takes longest stands there. Another process
+    begins with the last, the largest, and already holds the one before that, which is small.
     """
     first, last = ("residual", "fit", "where"), ("viewer", "formulas", "response", "data")
     makers: dict[str, tuple[str, Maker]] = {

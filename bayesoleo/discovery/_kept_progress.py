@@ -9,8 +9,8 @@ from bayesoleo.discovery._round import Progress
 
 
 class Kept:
-    """Keeps how far a search has come as the work that follows begins: other processes, where there
-    are some, do theirs meanwhile, and would wait for as long as several scores take.
+    """Keeps how far a search has come as the work that follows begins. Where other processes take
+    part in that, they need not wait: to keep it takes as long as several scores.
 
     What has not been kept is kept on leaving, by an exception too.
 

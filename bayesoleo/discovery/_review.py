@@ -133,7 +133,7 @@ def reviewed(
     replacing : bool
         Whether an effect may be replaced by one that does better.
     before : callable
-        Called before any work.
+        Called before each effect is reviewed.
 
     Returns
     -------

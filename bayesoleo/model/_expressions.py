@@ -177,7 +177,8 @@ def extreme(kind: Any, *arguments: sp.Expr) -> sp.Expr:
     """The largest or the smallest of several.
 
     SymPy compares them in their factored form as well, which takes longer than all else that is
-    done to most effects. Beside zero that is left out where the sign of the other one is unknown.
+    done to most effects. That is left out beside zero, where the sign of the other one is unknown
+    and it is not zero in other words.
 
     Parameters
     ----------
@@ -189,15 +190,18 @@ def extreme(kind: Any, *arguments: sp.Expr) -> sp.Expr:
     return cast(sp.Expr, kind(*arguments, evaluate=not unknown))
 
 
+@lru_cache(maxsize=2_000)
 def _has_no_sign(expression: sp.Expr) -> bool:
-    """Whether SymPy does not know on which side of zero it is; of an extreme it may find that."""
+    """Whether SymPy knows no sign of an expression, which is not itself an extreme."""
     above, below = expression.is_extended_nonnegative, expression.is_extended_nonpositive
-    return above is None and below is None and not isinstance(expression, sp.Max | sp.Min)
+    if above is not None or below is not None or isinstance(expression, sp.Max | sp.Min):
+        return False
+    return bool(sp.expand(expression) != 0)
 
 
 def _as_different(kind: Any, *arguments: sp.Expr) -> sp.Expr:
-    """The largest or the smallest of several that stay as different as they were: to compare them
-    anew takes most of the time that SymPy's own replacement does."""
+    """The largest or the smallest of several, which are not compared: that takes most of the time
+    of SymPy's own replacement."""
     return cast(sp.Expr, kind(*arguments, evaluate=False))
 
 

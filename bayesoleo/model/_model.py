@@ -51,7 +51,7 @@ def _slope(term: sp.Expr, moving: sp.Symbol, numbers: frozenset[tuple[sp.Symbol,
 
 
 @lru_cache(maxsize=20_000)
-def _expanded(term: sp.Expr, table: tuple[tuple[sp.Symbol, sp.Expr], ...]) -> sp.Expr:
+def _without_definitions(term: sp.Expr, table: tuple[tuple[sp.Symbol, sp.Expr], ...]) -> sp.Expr:
     """A term with the names of definitions replaced by what stands behind them. Models of a search
     share most of their terms and definitions."""
     # One pass is enough for names declared in order; an effect may refer to a later one.
@@ -267,7 +267,8 @@ class Model:
         table = tuple((symbol(name), body) for name, body in self.definitions.items())
         if not table:
             return expression
-        return sp.Add(*(_expanded(term, table) for term in sp.Add.make_args(expression)))
+        terms = [_without_definitions(term, table) for term in sp.Add.make_args(expression)]
+        return terms[0] if len(terms) == 1 else sp.Add(*terms)
 
     @cached_property
     def _expanded(self) -> dict[tuple[str, str], sp.Expr]:

@@ -14,7 +14,7 @@ POSITIVE = sp.Symbol("p", positive=True)
 ARGUMENTS = [
     sp.Integer(0), sp.Integer(2), X, X - Y, X**2, -(X**2) - 1, POSITIVE, -POSITIVE, X * POSITIVE,
     sp.Abs(X) - POSITIVE, sp.Max(X, 0), sp.Min(X, 0), sp.Max(X, Y), sp.Min(0, X - Y) - 1,
-    X**2 - 2 * X * Y + Y**2,
+    X * Y - X - X * (Y - 1), X**2 - 2 * X * Y + Y**2,
 ]  # fmt: skip
 
 
@@ -37,6 +37,19 @@ def test_a_symbol_in_an_extreme_becomes_what_its_sign_is_known_of():
     assert with_symbol_as(opened, X, -POSITIVE) == 0
     assert with_symbol_as(opened, X, Y) == sp.Max(Y, 0)
     assert parse("positive(x)", {"x": X}, (), "here") == opened
+
+
+def test_a_term_that_is_zero_in_other_words_is_none():
+    """It would switch where nothing does."""
+    hidden = X * Y - X - X * (Y - 1)
+    assert hidden != 0
+    opened = parse("max(z, 0)", {"z": symbol("z")}, (), "here")
+    for found in (
+        parse("positive(hidden)", {"hidden": hidden}, (), "here"),
+        with_symbol_as(opened, symbol("z"), hidden),
+    ):
+        assert not found.has(sp.Max)
+        assert sp.expand(found) == 0
 
 
 def test_definitions_are_replaced_in_each_term_and_what_cancels_is_gone():
