@@ -107,9 +107,10 @@ def close(
     """Close the loop: estimate, find what is missing, add it, sample the posterior, compare before
     and after.
 
-    The estimate and each round are kept as the work that follows them begins: the same call, with
-    the same campaign, model and settings, goes on after the last one. While the search goes on,
-    its result so far is written as well, once a minute at most.
+    The estimate and each round are kept as soon as they are known, in a quick search that other
+    processes help with half a second later: the same call, with the same campaign, model and
+    settings, goes on after the last one. While the search goes on, its result so far is written as
+    well, once a minute at most.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""When the progress of a search is kept: not while other processes wait for this one."""
+"""When the progress of a search is kept."""
 
 from __future__ import annotations
 
@@ -9,23 +9,29 @@ from bayesoleo.discovery._round import Progress
 
 
 class Kept:
-    """Keeps how far a search has come as the work that follows begins. Where other processes take
-    part in that, they need not wait: to keep it takes as long as several scores.
+    """Keeps how far a search has come, at once or as the work that follows begins.
 
-    What has not been kept is kept on leaving, by an exception too.
+    To keep it takes as long as several scores, for which other processes would wait. What has not
+    been kept is kept on leaving, by an exception too.
 
     Parameters
     ----------
     keep : callable
         Receives the progress.
+    at_once : bool
+        Whether :meth:`later` is :meth:`now`.
     """
 
-    def __init__(self, keep: Callable[[Progress], object] = lambda _: None) -> None:
-        self._keep, self._left = keep, list[Progress]()
+    def __init__(
+        self, keep: Callable[[Progress], object] = lambda _: None, *, at_once: bool = False
+    ) -> None:
+        self._keep, self._at_once, self._left = keep, at_once, list[Progress]()
 
     def later(self, known: Progress) -> None:
         """Keep this progress at the next :meth:`now`, in place of an earlier one."""
         self._left[:] = [known]
+        if self._at_once:
+            self.now()
 
     def now(self) -> None:
         """Keep what has not been kept."""

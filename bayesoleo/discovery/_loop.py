@@ -20,6 +20,7 @@ import numpy as np
 from scipy import stats
 
 from bayesoleo import _schema as schema
+from bayesoleo._first_compilation import has_others
 from bayesoleo._parallel import single_blas_thread
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._alternatives import best_of_beam, eliminated
@@ -377,7 +378,9 @@ def close_loop(
     -------
     ClosedLoop
     """
-    kept = Kept(keep)
+    # Nobody waits for a process that is alone, and a round of a long search is worth more than the
+    # half second for which others do.
+    kept = Kept(keep, at_once=provisional is None or not has_others(numerics.jobs))
     search = SearchOptions(
         roles, numerics, effects, seed, max_effects, nonparametric, kept, callback, keep_columns,
         most_work,

@@ -49,3 +49,13 @@ def test_what_cannot_be_kept_is_not_tried_again():
     with pytest.raises(OSError, match="full"):
         search()
     assert calls == ["estimate"]
+
+
+def test_a_process_that_nobody_waits_for_keeps_at_once():
+    seen = []
+    with Kept(seen.append, at_once=True) as kept:
+        kept.later("estimate")
+        assert seen == ["estimate"]
+        kept.later("first round")
+        kept.now()
+    assert seen == ["estimate", "first round"]
