@@ -103,7 +103,7 @@ class Dispatcher:
 
     def __init__(self, compile_one, known=False):
         self.py_func, self.compile, self.targetctx = entered, compile_one, None
-        self._cache = self
+        self._cache, self.overloads = self, {}
         self.known = known
 
     def holds(self, *_):

@@ -58,8 +58,8 @@ def test_the_better_start_does_not_depend_on_processes(beyond, monkeypatch):
     problem = beyond.fit.problem
     assert alone[problem.names.index("stiffness")] == pytest.approx(STIFFNESS, rel=1e-2)
     monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
-    monkeypatch.setattr(processes, "WORTH_STARTING", 0.0)
     monkeypatch.setattr(processes, "WORTH_ASKING", 0.0)
+    processes.process_of(0)  # none is started before an item is done here
     asked, kinds, read = [], [], processes.content_of
 
     def noted(*given):
