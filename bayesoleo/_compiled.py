@@ -246,6 +246,7 @@ inner = cached(
     no_cfunc_wrapper=True,
     pipeline_class=LinkedCompiler,
 )
+
 #: Points in a block, and the distance between rows.
 BLOCK = 64
 

@@ -37,7 +37,7 @@ SELDOM = 200_000, 10, 10
 #: Settings of the GNU C library and their values in such a process: bytes from which an array has
 #: pages of its own, and bytes free at the end of the heap from which they go back to the system.
 #: At its own values arrays of a megabyte get new pages, which are filled with zeros, again and
-#: again: a third of all page faults of a command, half a second.
+#: again.
 MMAP_THRESHOLD, TRIM_THRESHOLD = (-3, 2**25), (-1, 2**28)
 #: Bytes that a pipe is to hold: messages have megabytes. All pipes of a user may hold 64 MiB.
 PIPE = 2**18

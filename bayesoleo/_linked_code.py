@@ -2,8 +2,7 @@
 
 Numba optimises every function and makes machine code of it, and once more of all that calls it, in
 which it is contained: a chain of calls costs a multiple. Where only compiled code calls a function,
-its own machine code never runs. Without it, a first run compiles a sixth less. Such functions must
-not call each other in a circle.
+its own machine code never runs. Such functions must not call each other in a circle.
 """
 
 from __future__ import annotations

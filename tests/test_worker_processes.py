@@ -115,8 +115,10 @@ def test_memory_that_arrays_have_left_serves_the_next_ones():
         )
         for how in ("kept", "usual")
     )
-    # 80 arrays of 586 pages: a few faults are those of Python itself.
-    assert kept < 500 < 20_000 < usual
+    # 80 arrays of 586 pages, or of fewer where the system gives larger ones: a few faults are those
+    # of Python itself.
+    assert kept < 500
+    assert 5 * kept + 500 < usual
 
 
 @pytest.mark.parametrize("library", [OSError, TypeError, None])
