@@ -15,8 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayesoleo._types import Array
+from bayesoleo.discovery._signatures import FittedSignatures
 from bayesoleo.error_models._base import Frame
-from bayesoleo.error_models._catalogue_discrepancy import CatalogueErrors, Linearised
+from bayesoleo.error_models._catalogue_discrepancy import CatalogueErrors
+from bayesoleo.error_models._catalogue_evidence import Linearised
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._least_squares import PriorScale
 from bayesoleo.estimation._problem import Evaluation, undisturbed
@@ -34,13 +36,32 @@ _RUN_AWAY = 1e100
 _FAR = 20.0
 
 
-def linearised_of(problem: CampaignProblem, theta: Array) -> Linearised:
+def linearised_of(
+    problem: CampaignProblem, theta: Array, signatures: FittedSignatures
+) -> Linearised:
     """Posterior about an estimate with effects of the catalogue and a smooth remainder.
 
     Unknowns are in units of their priors' standard deviations. See
-    :meth:`~bayesoleo.error_models.CatalogueErrors.linearised`; the problem has signatures.
+    :meth:`~bayesoleo.error_models.CatalogueErrors.linearised`.
     """
-    return _About(problem).linearised(theta, problem.evaluate(theta))
+    found, scale = problem.evaluate(theta), PriorScale.of(problem.priors, problem.names)
+    both = [
+        np.vstack([(j * scale.sd).T, e])
+        for j, e in zip(found.sensitivity, found.residual, strict=True)
+    ]
+    evidence, rows = signatures.evidence(_by_run(problem, both))
+    pull, precision = scale.quadratic(theta)
+    return evidence.linearised(rows, precision, pull)
+
+
+def _by_run(problem: CampaignProblem, columns: Sequence[Array]) -> list[list[Array]]:
+    """Arrays of each output over all samples, by run."""
+    counts = problem.counts
+    ends = np.cumsum(counts, axis=0)
+    return [
+        [column[..., a:b] for column, a, b in zip(columns, first, last, strict=True)]
+        for first, last in zip(ends - counts, ends, strict=True)
+    ]
 
 
 class _About:
@@ -56,21 +77,15 @@ class _About:
         scale = self.scale
         # Unknowns in units of their priors' deviations, lest the system depend on units.
         pull, precision = scale.quadratic(theta)
-        sensitivity = self._by_run([(j * scale.sd).T for j in found.sensitivity])
-        return self.errors.linearised(sensitivity, self._by_run(found.residual), precision, pull)
+        sensitivity = _by_run(self.problem, [(j * scale.sd).T for j in found.sensitivity])
+        return self.errors.linearised(
+            sensitivity, _by_run(self.problem, found.residual), precision, pull
+        )
 
     def height(self, theta: Array, residual: Sequence[Array]) -> float:
         """Log posterior density of unknowns with such residuals, up to a constant."""
         prior = float(self.scale.log_density(theta[None])[0])
-        return prior + self.errors.log_evidence(self._by_run(residual))
-
-    def _by_run(self, columns: Sequence[Array]) -> list[list[Array]]:
-        counts = self.problem.counts
-        ends = np.cumsum(counts, axis=0)
-        return [
-            [column[..., a:b] for column, a, b in zip(columns, first, last, strict=True)]
-            for first, last in zip(ends - counts, ends, strict=True)
-        ]
+        return prior + self.errors.log_evidence(_by_run(self.problem, residual))
 
 
 @dataclass(frozen=True)

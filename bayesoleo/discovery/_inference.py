@@ -249,7 +249,6 @@ def chosen_for(
     signatures = FittedSignatures.of(
         fit, assembly, noise, effects=effects, held_out=held_out, scanned=scanned, jobs=jobs
     )
-    fit.problem.signatures = signatures.signatures
     if word == CATALOGUE:
         fit.problem.signatures = signatures.with_curves(jobs)
         return inference
@@ -261,10 +260,11 @@ def chosen_for(
             beside = gain_beside_colour(fit, signatures.signatures)
             if beside < MORE_THAN_NOISE:
                 return beside
-        return linearised_of(fit.problem, fit.point.theta).log_odds
+        return linearised_of(fit.problem, fit.point.theta, signatures).log_odds
 
     word, reason = error_model_by(noise.p_value, rise, fit.predictor.outputs, undecided)
     if word == CATALOGUE:
+        fit.problem.signatures = signatures.signatures
         word, reason = _unless_priors_decide(fit, reason)
     else:
         word, reason = _by_spectra(known, word, reason, asked=True)

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import scipy.fft
-from numpy.typing import NDArray
 from scipy import optimize, stats
 from scipy.special import expit
 
-from bayesoleo._types import Array
+from bayesoleo._types import Array, Flags
 from bayesoleo._worker_processes import process_map
 from bayesoleo.data._noise import HARMONICS, PeriodicAverage, noise_spectrum, periodic_average
 from bayesoleo.discovery._assembly import Assembly, Option
@@ -25,10 +24,12 @@ from bayesoleo.discovery._ranking import scales_of
 from bayesoleo.discovery._run_predictions import Prediction, sample_noise
 from bayesoleo.discovery._samples_that_count import without_masked
 from bayesoleo.discovery._scanned_columns import Columns, Scanned
-from bayesoleo.discovery._score_basis import LEAST, coefficients
+from bayesoleo.discovery._score_basis import LEAST
 from bayesoleo.discovery._score_tests import columns_of, cost_of
+from bayesoleo.discovery._signature_products import Column, UnitProducts
 from bayesoleo.effects._effect import Effect
-from bayesoleo.error_models._signatures import Signatures, alike, curves_of, equal_shares
+from bayesoleo.error_models._catalogue_evidence import CatalogueEvidence
+from bayesoleo.error_models._signatures import Rows, Signatures, alike, curves_of, equal_shares
 from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.prediction._records import Record
 from bayesoleo.solvers._orbit import Status
@@ -296,15 +297,18 @@ class FittedSignatures:
         The effects.
     groups : tuple of _Group
         Signatures that the model's parameters do not have.
-    signatures : Signatures
-        Without the curves that draws need.
+    about : Signatures
+        Without samples, and without the curves that draws need.
+    products : UnitProducts
+        Of the signatures.
     """
 
     fit: ModelFit
     others: tuple[ModelFit, ...]
     options: Sequence[Option]
     groups: tuple[_Group, ...]
-    signatures: Signatures
+    about: Signatures
+    products: UnitProducts
 
     @classmethod
     def of(
@@ -349,14 +353,36 @@ class FittedSignatures:
             scales = scales_of(fit, assembly.drive, assembly.native)
             options = assembly.options(scales, None if effects is None else tuple(effects))
             known = options, process_map(columns_of, fit, options, jobs, cost=partial(cost_of, fit))
-        sensitivity = _sensitivity(fit, noise)
-        gram, groups = sensitivity @ sensitivity.T, list[_Group]()
+        groups = list[_Group]()
         for place, (option, columns) in enumerate(zip(*known, strict=True)):
-            found = _groups(fit, others, place, option, columns)
-            scaled = (_scaled(fit, noise, group, sensitivity, gram) for group in found)
-            groups += [group for group in scaled if group is not None]
-        signatures = _assembled(fit, others, noise, groups)
-        return cls(fit, others, known[0], tuple(groups), signatures)
+            groups += _groups(fit, others, place, option, columns)
+        products = UnitProducts.of(fit, noise.sigma, _columns(groups))
+        groups, kept = _sized(fit, groups, products)
+        share = equal_shares([g.family for g in groups], [g.member for g in groups])
+        groups = [replace(g, root=float(np.sqrt(w))) for g, w in zip(groups, share, strict=True)]
+        scale = np.zeros(kept.size)
+        scale[kept] = _scales(groups)
+        products = products.keeping(kept, scale)
+        about = _without_samples(fit, others, noise, groups, products)
+        return cls(fit, others, known[0], tuple(groups), about, products)
+
+    @cached_property
+    def signatures(self) -> Signatures:
+        """The signatures at all fitted samples, without curves: hundreds of megabytes."""
+        columns, scales, tables = _columns(self.groups), _scales(self.groups), list[Array]()
+        for r, record in enumerate(self.fit.records):
+            shape = len(self.about.noise), len(columns), int(self.fit.problem.counts[r, 0])
+            tables.append(np.zeros(shape))
+            for k, values in enumerate(columns):
+                if record.label in values:
+                    np.multiply(values[record.label], scales[k], out=tables[r][:, k])
+        return replace(self.about, columns=tuple(tables))
+
+    def evidence(self, rows: Sequence[Sequence[Array]]) -> tuple[CatalogueEvidence, Sequence[Rows]]:
+        """What the signatures do together, and rows ``(q, n)`` by run and output beside them; no
+        table of all signatures is made."""
+        columns, scales = _columns(self.groups), _scales(self.groups)
+        return self.products.evidence(self.fit, self.about, columns, scales, rows)
 
     def with_curves(self, jobs: int | None = None) -> Signatures:
         """The signatures with the curves of all runs, those that were not fitted included."""
@@ -381,14 +407,14 @@ class FittedSignatures:
         rows = [(group, name) for group in self.groups for name in group.columns]
         samples = int(one.problem.counts[r, 0])
         table = np.zeros((len(one.predictor.outputs), len(rows), samples))
-        scale = np.sqrt(self.signatures.share)
+        scale = _scales(self.groups)
         for k, (group, name) in enumerate(rows):
             columns = known[group.place]
             if isinstance(columns, Status) or name not in columns[group.shape].names:
                 continue
             block = columns[group.shape]
             values = one.problem.kept(r, block.by_run[r][:, block.names.index(name)])
-            np.multiply(values, scale[k] / group.size, out=table[:, k])
+            np.multiply(values, scale[k], out=table[:, k])
         return table
 
 
@@ -397,19 +423,17 @@ class _Group:
     """Signatures of one parameter of one effect at one set of shapes; one a run if it has several.
 
     ``place`` and ``shape`` say of which option and set of its shapes. ``columns`` holds, by
-    unknown, arrays (ny, N) by run label, which ``size`` divides; of unknowns of runs that were not
-    fitted it holds none. Where it is one unknown, ``direction`` is what it does beside the model's
-    parameters, over all fitted samples in units of the noise, of unit length, (n,): single
-    precision is good to some 1e-6 of a cosine.
+    unknown, arrays (ny, N) by run label, which ``size`` divides and ``root`` of the share of the
+    prior variance multiplies; of unknowns of runs that were not fitted it holds none.
     """
 
     family: str
     member: str
     place: int
     shape: int
-    columns: Mapping[str, Mapping[str, Array]]
+    columns: Mapping[str, Column]
     size: float = 1.0
-    direction: NDArray[np.float32] | None = None
+    root: float = 1.0
 
 
 def _columns_of_other(others: Sequence[ModelFit], task: tuple[int, Option]) -> Columns:
@@ -442,70 +466,46 @@ def _groups(
     return found
 
 
-def _flat(fit: ModelFit, noise: Noise, column: Mapping[str, Array]) -> Array:
-    """A signature over all fitted runs and outputs in units of the noise, shape (n,)."""
-    parts = []
-    for r, record in enumerate(fit.records):
-        values = column.get(record.label)
-        if values is None:
-            values = np.zeros((len(noise.sigma), fit.problem.counts[r, 0]))
-        parts.append((values / noise.sigma[:, None]).ravel())
-    return np.concatenate(parts)
+def _columns(groups: Sequence[_Group]) -> list[Column]:
+    """The signatures one after the other, unscaled."""
+    return [values for group in groups for values in group.columns.values()]
 
 
-def _sensitivity(fit: ModelFit, noise: Noise) -> Array:
-    """Sensitivities of the model's unknowns likewise, of unit length, shape (l, n)."""
-    names = fit.predictor.layout.names
-    free = [names.index(name) for name in fit.problem.names]
-    rows = []
-    for name in free:
-        column = {
-            record.label: fit.problem.kept(r, fit.predictions[r].sensitivity[:, name])
-            for r, record in enumerate(fit.records)
-        }
-        rows.append(_flat(fit, noise, column))
-    table = np.array(rows).reshape(len(free), -1)
-    norm = np.linalg.norm(table, axis=1, keepdims=True)
-    return np.asarray(table / np.where(norm > 0, norm, 1.0))
+def _scales(groups: Sequence[_Group]) -> Array:
+    """What multiplies each of them, shape (k,)."""
+    return np.array([group.root / group.size for group in groups for _ in group.columns])
 
 
-def _scaled(
-    fit: ModelFit, noise: Noise, group: _Group, sensitivity: Array, gram: Array
-) -> _Group | None:
-    """The group at unit size beside the parameters; None if these do the same, or it is zero."""
-    rows = np.array([_flat(fit, noise, column) for column in group.columns.values()])
-    beside = rows - coefficients(gram, sensitivity @ rows.T).T @ sensitivity
-    whole, left = float(np.sum(rows**2)), float(np.sum(beside**2))
-    if not (np.isfinite(whole) and whole > 0) or left <= LEAST * whole:
-        return None
-    size = max(float(np.sqrt(left)), LEAST_BESIDE * float(np.sqrt(whole))) / rows.shape[1] ** 0.5
-    direction = None
-    if len(beside) == 1:
-        direction = (beside[0] / np.sqrt(left)).astype(np.float32)
-    return replace(group, size=size, direction=direction)
+def _sized(
+    fit: ModelFit, groups: Sequence[_Group], products: UnitProducts
+) -> tuple[list[_Group], Flags]:
+    """Groups at unit size beside the model's parameters, and which signatures are theirs, (k,);
+    without those that are zero, or that the parameters do as well."""
+    found, kept, first = list[_Group](), np.zeros(len(products.whole), dtype=np.bool_), 0
+    samples, left = int(fit.problem.counts.sum()), np.diag(products.beside)
+    for group in groups:
+        own = slice(first, first + len(group.columns))
+        first, whole, beside = own.stop, float(products.whole[own].sum()), float(left[own].sum())
+        if np.isfinite(whole) and whole > 0 and beside > LEAST * whole:
+            size = max(beside**0.5, LEAST_BESIDE * whole**0.5) / samples**0.5
+            found.append(replace(group, size=size))
+            kept[own] = True
+    return found, kept
 
 
-def _assembled(
-    fit: ModelFit, others: Sequence[ModelFit], noise: Noise, groups: Sequence[_Group]
+def _without_samples(
+    fit: ModelFit,
+    others: Sequence[ModelFit],
+    noise: Noise,
+    groups: Sequence[_Group],
+    products: UnitProducts,
 ) -> Signatures:
-    """All signatures in the order of their groups, without curves."""
-    share = equal_shares([g.family for g in groups], [g.member for g in groups])
-    columns = [
-        (f"{group.member} {name}", float(np.sqrt(part)), group.size, values)
-        for group, part in zip(groups, share, strict=True)
-        for name, values in group.columns.items()
-    ]
-    shares = np.array([root**2 for _, root, _, _ in columns])
+    """All signatures in the order of their groups, without samples and curves."""
+    shares = np.array([group.root**2 for group in groups for _ in group.columns])
     usable = np.flatnonzero([len(g.columns) == 1 for g in groups for _ in g.columns])
-    directions = [g.direction for g in groups if g.direction is not None]
-    first, odds = alike(np.array(directions), shares[usable], ALIKE)
-    outputs, table = len(noise.sigma), []
-    for r, record in enumerate(fit.records):
-        block = np.zeros((outputs, len(columns), int(fit.problem.counts[r, 0])))
-        for k, (_, root, size, values) in enumerate(columns):
-            if record.label in values:
-                np.multiply(values[record.label], root / size, out=block[:, k])
-        table.append(block)
+    length = np.sqrt(np.diag(products.beside)[usable])
+    cosines = products.beside[np.ix_(usable, usable)] / np.outer(length, length)
+    first, odds = alike(np.square(cosines), shares[usable], ALIKE)
     origins = {
         record.label: one.problem.samples[r].origin
         for one in (fit, *others)
@@ -513,12 +513,12 @@ def _assembled(
     }
     swing = [
         np.concatenate([run.measured[b] for run in fit.predictor.runs]).std()
-        for b in range(outputs)
+        for b in range(len(noise.sigma))
     ]
     return Signatures(
-        tuple(name for name, *_ in columns),
+        tuple(f"{group.member} {name}" for group in groups for name in group.columns),
         tuple(fit.problem.runs),
-        tuple(table),
+        (),
         noise.sigma,
         noise.colour,
         {},

@@ -10,6 +10,8 @@ from ._base import (
 )
 from ._catalogue_discrepancy import (
     CatalogueErrors as CatalogueErrors,
+)
+from ._catalogue_evidence import (
     Linearised as Linearised,
 )
 from ._correlated import (

@@ -173,13 +173,13 @@ def equal_shares(families: Sequence[str], members: Sequence[str]) -> Array:
     return np.array([1.0 / (len(inside[pair[0]]) * pairs.count(pair)) for pair in pairs])
 
 
-def alike(directions: Array, share: Array, most: float) -> tuple[Integers, Array]:
+def alike(squared: Array, share: Array, most: float) -> tuple[Integers, Array]:
     """One signature for each group of nearly equal ones, and the groups' shares of the variance.
 
     Parameters
     ----------
-    directions : ndarray, shape (k, n)
-        Of unit length; single precision is enough.
+    squared : ndarray, shape (k, k)
+        Squared cosines between signatures.
     share : ndarray, shape (k,)
     most : float
         Squared cosine above which two are alike.
@@ -191,7 +191,6 @@ def alike(directions: Array, share: Array, most: float) -> tuple[Integers, Array
     odds : ndarray, shape (q,)
         They sum to one.
     """
-    squared = np.square(directions @ directions.T) if len(directions) else np.zeros((0, 0))
     kept, odds = list[int](), list[float]()
     for own, row in enumerate(squared):
         like = row[kept]
@@ -259,31 +258,6 @@ def project_rows(rows: Array, table: Array, out: Array, squares: Array) -> None:
             squares[lane] += a * a
             for j in range(size):
                 out[lane, j] += a * table[i, j]
-
-
-@dataclass(frozen=True)
-class Part:
-    """One output of one run in units of its noise, whitened.
-
-    Parameters
-    ----------
-    table : ndarray, shape (n, m + R_c)
-        Orthonormal basis of the smooth functions, then that of the signatures.
-    size : int
-        ``m``, number of smooth functions.
-    power : ndarray, shape (m,)
-        Prior variances of the smooth functions' coefficients, at size one.
-    shared : ndarray, shape (m, R)
-        What the coefficients that runs share change along the smooth functions.
-    scale : float
-        Logarithm of the determinant of the whitening, its unit included.
-    """
-
-    table: Array
-    size: int
-    power: Array
-    shared: Array
-    scale: float
 
 
 @dataclass(frozen=True)
@@ -387,24 +361,16 @@ class Shared:
         return np.asarray(self.deviation * drawn)
 
 
-def range_of(columns: Sequence[Sequence[Array]], noise: Array) -> tuple[Array, Array]:
-    """Squared sizes (R,) of the directions that signatures span, and their coefficients (k, R).
+def range_of(gram: Array) -> Array:
+    """Coefficients (k, R) of the directions that signatures span, the largest first.
 
     Parameters
     ----------
-    columns : sequence of sequence of ndarray, each shape (k, n)
-        Signatures in each run and output.
-    noise : ndarray, shape (s,)
-        Standard deviations of the outputs' noise, the unit of sizes.
+    gram : ndarray, shape (k, k)
+        Products of the signatures with each other over all runs and outputs, in units of the noise.
     """
-    gram = sum(
-        (block @ block.T) / unit**2
-        for row in columns
-        for block, unit in zip(row, noise, strict=True)
-    )
     values, vectors = np.linalg.eigh(gram)
-    kept = values > NEGLIGIBLE
-    return values[kept][::-1], np.ascontiguousarray(vectors[:, kept][:, ::-1])
+    return np.ascontiguousarray(vectors[:, values > NEGLIGIBLE][:, ::-1])
 
 
 def forward(factor: Array, right: Array) -> Array:

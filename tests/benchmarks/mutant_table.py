@@ -426,9 +426,11 @@ ERROR_MODELS: Rows = {
          "pivot = rho[:, None, :, None] * (1 + 1.0 * remainder",
          "posterior/test_catalogue_errors.py::test_density_is_that_of_its_definition"),
         ("an effect that acts alone pays the whole logarithm",
-         "return self._log_odds[:, None] + 0.5 * (gain - np.log1p(more)), score, information",
-         "return self._log_odds[:, None] + 0.5 * gain - np.log1p(more), score, information",
+         "return known.log_odds[:, None] + 0.5 * (gain - np.log1p(more)), score, information",
+         "return known.log_odds[:, None] + 0.5 * gain - np.log1p(more), score, information",
          "posterior/test_catalogue_errors.py::test_density_is_that_of_its_definition"),
+    ],
+    "error_models/_catalogue_evidence.py": [
         ("evidence without the volume of the unknowns",
          "logs = logs - float(np.linalg.slogdet(covariance)[1])",
          "logs = logs - 0.0 * float(np.linalg.slogdet(covariance)[1])",
@@ -437,6 +439,16 @@ ERROR_MODELS: Rows = {
 }
 
 DISCOVERY: Rows = {
+    "discovery/_signature_products.py": [
+        ("signatures are sized with what the model's parameters do as well",
+         "total - (cross * share) @ cross.T",
+         "total",
+         "discovery/test_signature_products.py::test_an_effect_leaves_as_much_as_noise_beside_the_parameters"),
+        ("coloured noise counts as white",
+         "gram = white @ white.T",
+         "gram = gram",
+         "discovery/test_signature_products.py::test_evidence_is_that_of_the_whole_table"),
+    ],
     "discovery/_refit.py": [
         ("present unknowns stay where an effect's estimate starts",
          "value + part * moved.get(name, 0.0)",

@@ -55,7 +55,7 @@ from bayesoleo.discovery._signatures import (
 )
 from bayesoleo.error_models import CatalogueErrors, Frame, Signatures
 from bayesoleo.error_models._base import RunSamples
-from bayesoleo.error_models._catalogue_discrepancy import Linearised
+from bayesoleo.error_models._catalogue_evidence import Linearised
 from bayesoleo.error_models._correlated import effective_samples
 from bayesoleo.estimation._problem import Evaluation, Misfit
 from bayesoleo.model import Normal

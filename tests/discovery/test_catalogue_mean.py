@@ -7,7 +7,7 @@ import pytest
 
 from bayesoleo.discovery import _catalogue_mean as catalogue_mean
 from bayesoleo.discovery._catalogue_mean import shifted
-from bayesoleo.error_models._catalogue_discrepancy import Linearised
+from bayesoleo.error_models._catalogue_evidence import Linearised
 from bayesoleo.estimation._least_squares import PriorScale
 from bayesoleo.estimation._problem import Evaluation
 from bayesoleo.model import LogNormal, Normal, Uniform

@@ -21,7 +21,7 @@ from bayesoleo.discovery._scanned_columns import Scanned
 from bayesoleo.discovery._signatures import more_than_noise_p, noise_of, signatures_of
 from bayesoleo.discovery._state import State, fit_state
 from bayesoleo.effects import find_effect
-from bayesoleo.error_models._catalogue_discrepancy import Linearised
+from bayesoleo.error_models._catalogue_evidence import Linearised
 
 SEEDS = 12
 

@@ -12,7 +12,7 @@ from bayesoleo.discovery._inference import error_model_by
 from bayesoleo.discovery._signatures import Lines, colour_of, spectrum_of_process
 from bayesoleo.error_models import CatalogueErrors, Frame, Signatures, error_model
 from bayesoleo.error_models._base import RunSamples
-from bayesoleo.error_models._catalogue_discrepancy import ALONE, REMAINDERS
+from bayesoleo.error_models._catalogue_evidence import ALONE, REMAINDERS
 from bayesoleo.error_models._correlated import covariance
 from bayesoleo.error_models._signatures import (
     POINTS,
@@ -198,10 +198,11 @@ def test_near_copies_share_what_one_of_them_has():
     np.testing.assert_allclose(shares, [1 / 6, 1 / 6, 1 / 3, 1 / 3, 1])
     # The second is the first's negative, and the last but 0.89 of the third by its square.
     directions = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0.89**0.5, 0.11**0.5]])
-    single, odds = alike(directions.astype(np.float32), np.array([1.0, 1.0, 2.0, 4.0]), 0.9)
+    squared = np.square(directions @ directions.T)
+    single, odds = alike(squared, np.array([1.0, 1.0, 2.0, 4.0]), 0.9)
     np.testing.assert_array_equal(single, [0, 2, 3])
     np.testing.assert_allclose(odds, [0.25, 0.25, 0.5])
-    nothing, none = alike(np.zeros((0, 3)), np.zeros(0), 0.9)
+    nothing, none = alike(np.zeros((0, 0)), np.zeros(0), 0.9)
     assert nothing.size == none.size == 0
 
 

@@ -1,0 +1,176 @@
+"""Products of signatures, run by run, against the table of all signatures, by other algebra."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fitted_states import NUMERICS
+from small_campaigns import (
+    damper,
+    damper_campaign,
+    oscillator_campaign,
+    with_friction,
+)
+from test_coloured_transients import fitted
+
+from bayesoleo.discovery._assembly import Assembly, assign
+from bayesoleo.discovery._catalogue_mean import linearised_of
+from bayesoleo.discovery._fit import fit_model
+from bayesoleo.discovery._inference import Inference, chosen_for
+from bayesoleo.discovery._signatures import LEAST_BESIDE, FittedSignatures, noise_of
+from bayesoleo.effects import find_effect
+from bayesoleo.error_models import CatalogueErrors, Frame
+from bayesoleo.estimation._least_squares import PriorScale
+from bayesoleo.systems import system
+
+EFFECTS = ("coulomb_friction", "cubic_stiffness", "sensor_offset", "varies_by_run")
+#: Noise of an AR(1) process.
+SLOW = 0.9
+
+
+def _damper(folder, **options):
+    campaign = damper_campaign(folder, with_friction, **options)
+    return fit_model(damper(), assign(campaign.records).fitted, NUMERICS, check_mesh=False)
+
+
+def _masked(folder):
+    campaign = damper_campaign(folder, with_friction)
+    records = list(assign(campaign.records).fitted)
+    kept = np.ones(records[0].time.size, dtype=bool)
+    kept[100:180] = False
+    records[0] = replace(records[0], kept=kept)
+    return fit_model(damper(), records, NUMERICS, check_mesh=False)
+
+
+def _oscillator(folder):
+    campaign = oscillator_campaign(folder, restoring=lambda x, v: 100.0 * x + v + 400.0 * x**2)
+    return fit_model(system("duffing"), assign(campaign.records).fitted, NUMERICS, check_mesh=False)
+
+
+KINDS = {
+    "force law": _damper,
+    "coloured noise": lambda folder: _damper(folder, coloured=SLOW),
+    "samples left out": _masked,
+    "oscillator": _oscillator,
+    "transient, first order": lambda _: fitted("lag", "white", 0),
+    "transient, slow noise": lambda _: fitted("oscillator", "slow", 0),
+}
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def found(request, tmp_path_factory):
+    """A fit and the signatures of some effects at its estimate."""
+    fit = KINDS[request.param](tmp_path_factory.mktemp("runs"))
+    effects = tuple(find_effect(name) for name in EFFECTS)
+    noise, assembly = noise_of(fit), Assembly(fit.model)
+    signatures = FittedSignatures.of(fit, assembly, noise, effects=effects, jobs=1)
+    assert noise.coloured == (request.param == "coloured noise")
+    return fit, noise, signatures
+
+
+def _rows(fit, noise, columns):
+    """Signatures (s, k, n) of all runs in units of the noise, (k, all samples)."""
+    return np.concatenate(
+        [block[b] / noise.sigma[b] for block in columns for b in range(len(noise.sigma))], axis=1
+    )
+
+
+def _sensitivities(fit, noise):
+    """What parameters change, likewise."""
+    moved = fit.problem.evaluate(fit.point.theta).sensitivity
+    ends = np.cumsum(fit.problem.counts, axis=0)
+    starts = ends - fit.problem.counts
+    parts = [
+        moved[b][starts[r, b] : ends[r, b]].T / noise.sigma[b]
+        for r in range(len(fit.records))
+        for b in range(len(noise.sigma))
+    ]
+    return np.concatenate(parts, axis=1)
+
+
+def test_an_effect_leaves_as_much_as_noise_beside_the_parameters(found):
+    """Each at size one; one that parameters nearly imitate at a hundredth of itself at least."""
+    fit, noise, signatures = found
+    rows = _rows(fit, noise, signatures.signatures.columns)
+    assert len(rows) == len(signatures.about.names) >= 3
+    axes = np.linalg.qr(_sensitivities(fit, noise).T)[0]
+    beside = rows - (rows @ axes) @ axes.T
+    ends = np.cumsum([len(group.columns) for group in signatures.groups])
+    for group, last in zip(signatures.groups, ends, strict=True):
+        own = slice(last - len(group.columns), last)
+        left, whole = (np.sqrt(np.sum(table[own] ** 2)) for table in (beside, rows))
+        size = max(left, LEAST_BESIDE * whole) / np.sqrt(rows.shape[1])
+        assert size == pytest.approx(group.root, rel=1e-6)
+
+
+def test_signatures_that_are_alike_act_alone_as_one(found):
+    """Kept ones differ beside the parameters, and each left out is like one that is kept."""
+    fit, noise, signatures = found
+    rows = _rows(fit, noise, signatures.signatures.columns)
+    axes = np.linalg.qr(_sensitivities(fit, noise).T)[0]
+    beside = rows - (rows @ axes) @ axes.T
+    unit = beside / np.linalg.norm(beside, axis=1, keepdims=True)
+    squared = np.square(unit @ unit.T)
+    kept = signatures.about.single
+    assert np.all(squared[np.ix_(kept, kept)][~np.eye(len(kept), dtype=bool)] <= 0.9 + 1e-9)
+    single = np.flatnonzero([len(g.columns) == 1 for g in signatures.groups for _ in g.columns])
+    assert np.all(squared[np.ix_(single, kept)].max(axis=1) > 0.9 - 1e-9)
+    assert signatures.about.odds.sum() == pytest.approx(1.0)
+
+
+def test_evidence_is_that_of_the_whole_table(found):
+    fit, _, signatures = found
+    theta, problem = fit.point.theta, fit.problem
+    ours = linearised_of(problem, theta, signatures)
+    problem.signatures = signatures.signatures
+    errors = CatalogueErrors(Frame.of(problem))
+    problem.signatures = None
+    here, scale = problem.evaluate(theta), PriorScale.of(problem.priors, problem.names)
+    pull, precision = scale.quadratic(theta)
+    ends = np.cumsum(problem.counts, axis=0)
+    moved, left = (
+        [
+            [make(b)[..., first:last] for b, (first, last) in enumerate(zip(a, z, strict=True))]
+            for a, z in zip(ends - problem.counts, ends, strict=True)
+        ]
+        for make in (
+            lambda b: (here.sensitivity[b] * scale.sd).T,
+            lambda b: here.residual[b],
+        )
+    )
+    whole = errors.linearised(moved, left, precision, pull)
+    # Sums in another order; the evidence has squares of thousands of samples.
+    assert ours.log_odds == pytest.approx(whole.log_odds, rel=1e-8, abs=1e-6)
+    sd = np.sqrt(np.diag(whole.covariance))
+    np.testing.assert_allclose(ours.shift / sd, whole.shift / sd, atol=1e-6)
+    np.testing.assert_allclose(np.sqrt(np.diag(ours.covariance)), sd, rtol=1e-6)
+    assert len(ours.groups) == len(whole.groups)
+
+
+def test_no_table_of_all_signatures_is_made_for_a_choice_of_noise(tmp_path, monkeypatch):
+    """Friction that is hardly there: effects are looked for, and none is better than noise."""
+    fit = _damper(tmp_path, noise=0.5)
+    monkeypatch.setattr("bayesoleo.discovery._inference._without_catalogue", lambda *_: None)
+    monkeypatch.setattr("bayesoleo.discovery._inference.MORE_THAN_NOISE", np.inf)
+
+    def table(_):
+        raise AssertionError("made")
+
+    monkeypatch.setattr(FittedSignatures, "signatures", property(table))
+    effects = (find_effect("coulomb_friction"),)
+    chosen = chosen_for(Inference("auto"), fit, Assembly(fit.model), effects=effects, jobs=1)
+    assert chosen.error_model != "catalogue"
+    assert fit.problem.signatures is None
+
+
+def test_what_parameters_do_as_well_is_left_out(tmp_path):
+    """A damping force beside a damping coefficient that is estimated."""
+    fit = _damper(tmp_path)
+    effects = (find_effect("coulomb_friction"), find_effect("viscous_damping"))
+    signatures = FittedSignatures.of(
+        fit, Assembly(fit.model), noise_of(fit), effects=effects, jobs=1
+    )
+    assert any("coulomb_friction" in name for name in signatures.about.names)
+    assert not any("viscous_damping" in name for name in signatures.about.names)
