@@ -82,10 +82,7 @@ def size_of(fit: ModelFit, options: Sequence[Option]) -> int:
     samples = sum(record.time.size for record in fit.records)
     columns = 0
     for option in options:
-        parameters = option.model.parameters
-        unknowns = sum(
-            len(fit.records) if parameters[name].by_run else 1
-            for name in option.candidate.parameters
-        )
-        columns += unknowns * prod(len(values) for values in option.candidate.shapes.values())
+        # An unknown of one run's own has a column in that run alone.
+        unknowns, shapes = len(option.candidate.parameters), option.candidate.shapes
+        columns += unknowns * prod(len(values) for values in shapes.values())
     return 8 * columns * samples * len(fit.predictor.outputs)

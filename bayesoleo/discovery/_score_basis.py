@@ -18,7 +18,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesoleo._types import Array, Flags
+from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.data._noise import NoiseSpectrum
 from bayesoleo.discovery._fit import ModelFit
 from bayesoleo.discovery._fit_and_hold_out_error import RunError
@@ -192,12 +192,30 @@ class Block:
     ----------
     names : tuple of str
         Unknowns, by-run ones expanded.
-    by_run : list of ndarray, shape (ny, k, N)
-        One a run, SI.
+    by_run : list of ndarray, shape (ny, q, N)
+        One a run, SI: of the unknowns that act in that run. Of those of all other runs it would
+        hold zeros alone.
+    acting : list of ndarray of int, shape (q,), or None
+        By run, numbers of these unknowns; None where each run has all.
     """
 
     names: tuple[str, ...]
     by_run: list[Array]
+    acting: list[Integers] | None = None
+
+    @property
+    def numbers(self) -> list[Integers]:
+        """By run, numbers of the unknowns of which it has columns."""
+        every = np.arange(len(self.names))
+        return [every for _ in self.by_run] if self.acting is None else self.acting
+
+    def column(self, run: int, name: str) -> Array | None:
+        """What an unknown changes in a run, shape (ny, N); None where it does not act, or there is
+        no such unknown."""
+        if name not in self.names:
+            return None
+        place = np.flatnonzero(self.numbers[run] == self.names.index(name))
+        return self.by_run[run][:, place[0]] if place.size else None
 
 
 def sensitivities_of(
@@ -244,13 +262,12 @@ def sensitivities_of(
             finer = replace(fit, steps=2 * fit.steps)
             return sensitivities_of(finer, model, shapes) if coarse else derivatives
         for k, y_p in enumerate(derivatives):
-            full = np.zeros((y_p.shape[0], theta.size, y_p.shape[2]))
-            full[:, layout.columns[r]] = y_p
-            found[k].append(full)
+            found[k].append(y_p)
     # A shape whose motion is not found in some run is not seen, and scores nothing.
-    seen = [all(np.isfinite(full).all() for full in item) for item in found]
+    seen = [all(np.isfinite(y_p).all() for y_p in item) for item in found]
+    acting = list(layout.columns)
     return [
-        Block(layout.names, item if known else [np.zeros_like(full) for full in item])
+        Block(layout.names, item if known else [np.zeros_like(y_p) for y_p in item], acting)
         for item, known in zip(found, seen, strict=True)
     ]
 

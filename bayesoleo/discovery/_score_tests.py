@@ -350,7 +350,8 @@ def _attempt(base: Base, option: Option, columns: Sequence[Block]) -> Score | st
             continue
         thinned.append(score.columns)
         if base.data is not None:
-            signatures.append(_directions_of(base.data.columns(block.by_run)))
+            columns_of_data = base.data.columns(block.by_run, block.acting, len(block.names))
+            signatures.append(_directions_of(columns_of_data))
         if best is None or score.fall > best.fall:
             best, used = score, block
     if best is None:
@@ -371,10 +372,12 @@ def _evaluate(
 ) -> Score | None:
     k, size = len(block.names), base.gram.shape[0]
     cross, own, score = np.zeros((size, k)), np.zeros((k, k)), np.zeros(k)
-    columns = [flat(item) * run.scale for run, item in zip(base.runs, block.by_run, strict=True)]
-    for run, new in zip(base.runs, columns, strict=True):
+    columns = _in_units(base, block)
+    for run, acting, new in zip(base.runs, block.numbers, columns, strict=True):
         parts = run.products(new)
-        cross, own, score = cross + parts[0], own + parts[1], score + parts[2]
+        cross[:, acting] += parts[0]
+        own[np.ix_(acting, acting)] += parts[1]
+        score[acting] += parts[2]
     project = coefficients(base.gram, cross)
     information = own - cross.T @ project
     score = score - project.T @ base.gradient
@@ -389,7 +392,7 @@ def _evaluate(
     if not _allowed(option, block.names, expected):
         expected = np.zeros(k)
     fall = float(expected @ score)
-    thin = _thinned(base, columns, project)
+    thin = _thinned(base, block, columns, project)
     norms = np.linalg.norm(thin, axis=1, keepdims=True)
     root = float(np.sqrt(max(fall, 0.0)))
     return Score(
@@ -418,24 +421,30 @@ def _allowed(option: Option, names: Sequence[str], expected: Array) -> bool:
     return True
 
 
-def _thinned(base: Base, columns: Sequence[Array], project: Array) -> Array:
+def _in_units(base: Base, block: Block) -> list[Array]:
+    """A block's columns in noise units, outputs one after the other, by run."""
+    return [flat(item) * run.scale for run, item in zip(base.runs, block.by_run, strict=True)]
+
+
+def _thinned(base: Base, block: Block, columns: Sequence[Array], project: Array) -> Array:
     """``C_perp`` in noise units at some samples, shape (k, n)."""
     rows = []
-    for run, new in zip(base.runs, columns, strict=True):
-        rows.append(new[:, run.chosen] - project.T @ run.sensitivity[:, run.chosen])
+    for run, acting, new in zip(base.runs, block.numbers, columns, strict=True):
+        beside = -(project.T @ run.sensitivity[:, run.chosen])
+        beside[acting] += new[:, run.chosen]
+        rows.append(beside)
     return np.concatenate(rows, axis=1)
 
 
 def _directions(base: Base, block: Block, expected: Array) -> list[Array]:
     """What the expected parameters add to each run beside the present ones, in noise units."""
-    columns = [flat(item) * run.scale for run, item in zip(base.runs, block.by_run, strict=True)]
-    cross = np.zeros((base.gram.shape[0], expected.size))
-    for run, new in zip(base.runs, columns, strict=True):
-        cross += run.products(new)[0]
+    columns, cross = _in_units(base, block), np.zeros((base.gram.shape[0], expected.size))
+    for run, acting, new in zip(base.runs, block.numbers, columns, strict=True):
+        cross[:, acting] += run.products(new)[0]
     project = coefficients(base.gram, cross)
     return [
-        expected @ new - (project @ expected) @ run.sensitivity
-        for run, new in zip(base.runs, columns, strict=True)
+        expected[acting] @ new - (project @ expected) @ run.sensitivity
+        for run, acting, new in zip(base.runs, block.numbers, columns, strict=True)
     ]
 
 

@@ -410,11 +410,9 @@ class FittedSignatures:
         scale = _scales(self.groups)
         for k, (group, name) in enumerate(rows):
             columns = known[group.place]
-            if isinstance(columns, Status) or name not in columns[group.shape].names:
-                continue
-            block = columns[group.shape]
-            values = one.problem.kept(r, block.by_run[r][:, block.names.index(name)])
-            np.multiply(values, scale[k], out=table[:, k])
+            found = None if isinstance(columns, Status) else columns[group.shape].column(r, name)
+            if found is not None:
+                np.multiply(one.problem.kept(r, found), scale[k], out=table[:, k])
         return table
 
 
@@ -453,10 +451,11 @@ def _groups(
     for k, block in enumerate(columns):
         groups: dict[str, dict[str, dict[str, Array]]] = {}
         for r, record in enumerate(fit.records):
-            for j, name in enumerate(block.names):
-                group = groups.setdefault(name.split("[")[0], {})
-                values = fit.problem.kept(r, block.by_run[r][:, j])
-                group.setdefault(name, {})[record.label] = values
+            for name in block.names:
+                column = groups.setdefault(name.split("[")[0], {}).setdefault(name, {})
+                values = block.column(r, name)
+                if values is not None:
+                    column[record.label] = fit.problem.kept(r, values)
         for name, group in groups.items():
             if option.model.parameters[name].by_run:
                 # A run that was not fitted has an unknown of its own, of which data say nothing.

@@ -184,12 +184,31 @@ class SpectralData:
         """Number of the output that each coefficient belongs to, shape (n,)."""
         return np.concatenate([np.repeat(np.arange(len(self.outputs)), r.size) for r in self.runs])
 
-    def columns(self, by_run: Sequence[Array]) -> Array:
-        """Coefficients ``(k, n)`` of signals ``(outputs, k, N)`` of each run."""
+    def columns(
+        self,
+        by_run: Sequence[Array],
+        acting: Sequence[Integers] | None = None,
+        count: int | None = None,
+    ) -> Array:
+        """Coefficients ``(k, n)`` of signals ``(outputs, q, N)`` of each run.
+
+        Parameters
+        ----------
+        by_run : sequence of ndarray, shape (outputs, q, N)
+        acting : sequence of ndarray of int, shape (q,), optional
+            Which of the rows these are in each run: all others are zero there.
+        count : int, optional
+            ``k``, the number of rows; of as many as each run has if they are all.
+        """
         parts = []
-        for run, values in zip(self.runs, by_run, strict=True):
-            found = np.moveaxis(run.transformed(values), 1, 0)  # (k, outputs, size)
-            parts.append(found.reshape(found.shape[0], -1))
+        for r, (run, values) in enumerate(zip(self.runs, by_run, strict=True)):
+            found = np.moveaxis(run.transformed(values), 1, 0)  # (q, outputs, size)
+            rows = found.reshape(found.shape[0], -1)
+            if acting is not None and count is not None:
+                every = np.zeros((count, rows.shape[1]))
+                every[acting[r]] = rows
+                rows = every
+            parts.append(rows)
         return np.concatenate(parts, axis=1)
 
     def residual(self, fit: ModelFit) -> Array:

@@ -21,7 +21,7 @@ from small_campaigns import (
 
 from bayesoleo.discovery._assembly import Assembly, Roles
 from bayesoleo.discovery._score_basis import Base, Block, RunBase, _prior_terms, base_of
-from bayesoleo.discovery._score_tests import _directions_of, _evaluate, score_all
+from bayesoleo.discovery._score_tests import _directions, _directions_of, _evaluate, score_all
 from bayesoleo.discovery._state import fit_state
 from bayesoleo.model import Model, Output, Parameter
 from bayesoleo.model._priors import Normal
@@ -357,6 +357,37 @@ def test_amplitudes_that_do_the_same_are_one_direction():
     both = _evaluate(base, free_option(), {}, Block(("a", "b"), [columns[None]]))
     assert (alone.rank, twice.rank, both.rank) == (1, 1, 2)
     assert twice.fall == pytest.approx(alone.fall, rel=1e-9)
+
+
+def test_an_unknown_of_one_run_needs_no_zeros_in_another():
+    """Columns of those that act in a run do for the score, and for what it says of each run."""
+    rng = np.random.default_rng(3)
+    runs = []
+    for _ in range(2):
+        present = rng.standard_normal((1, 40))
+        _, one = synthetic(present)
+        runs.append(one.runs[0])
+    gram = sum(run.sensitivity @ run.sensitivity.T for run in runs)
+    gradient = sum(run.sensitivity @ run.residual for run in runs)
+    base = Base(None, runs, gram, gradient, 1.0, 1.0, 1.0)
+    shared, own = rng.standard_normal((2, 40)), rng.standard_normal((2, 40))
+    names = ("a", "b[first]", "b[second]")
+    few = [np.stack([shared[r], own[r]])[None] for r in range(2)]
+    acting = [np.array([0, 1]), np.array([0, 2])]
+    every = [np.zeros((1, 3, 40)) for _ in range(2)]
+    for whole, part, places in zip(every, few, acting, strict=True):
+        whole[:, places] = part
+    sparse, dense = Block(names, few, acting), Block(names, every)
+    one, other = (_evaluate(base, free_option(), {}, block) for block in (sparse, dense))
+    for name in ("fall", "expected", "columns", "contribution", "information", "beside"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-9, atol=1e-12)
+    pairs = zip(*(_directions(base, block, one.expected) for block in (sparse, dense)), strict=True)
+    for found, expected in pairs:
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert sparse.column(0, "b[second]") is None
+    assert sparse.column(0, "c") is None
+    np.testing.assert_array_equal(sparse.column(1, "b[second]")[0], own[1])
+    np.testing.assert_array_equal(dense.column(1, "b[first]")[0], 0.0)
 
 
 def test_a_score_away_from_the_estimate_is_what_the_effect_adds_to_a_refit():

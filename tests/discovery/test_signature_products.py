@@ -20,6 +20,7 @@ from bayesoleo.discovery._catalogue_mean import linearised_of
 from bayesoleo.discovery._fit import fit_model
 from bayesoleo.discovery._inference import Inference, chosen_for
 from bayesoleo.discovery._signatures import LEAST_BESIDE, FittedSignatures, noise_of
+from bayesoleo.discovery._spectral_data import SpectralData
 from bayesoleo.effects import find_effect
 from bayesoleo.error_models import CatalogueErrors, Frame
 from bayesoleo.estimation._least_squares import PriorScale
@@ -174,3 +175,19 @@ def test_what_parameters_do_as_well_is_left_out(tmp_path):
     )
     assert any("coulomb_friction" in name for name in signatures.about.names)
     assert not any("viscous_damping" in name for name in signatures.about.names)
+
+
+def test_lines_of_an_unknown_of_one_run_need_no_zeros_in_another(found):
+    """Of a by-run unknown each run has the columns of its own alone."""
+    fit, _, _ = found
+    rng, data = np.random.default_rng(0), SpectralData.of(fit)
+    sizes = [record.time.size for record in fit.records]
+    outputs, count = len(fit.predictor.outputs), len(sizes) + 1
+    few = [rng.standard_normal((outputs, 2, n)) for n in sizes]
+    acting = [np.array([0, r + 1]) for r in range(len(sizes))]
+    every = [np.zeros((outputs, count, n)) for n in sizes]
+    for whole, part, places in zip(every, few, acting, strict=True):
+        whole[:, places] = part
+    np.testing.assert_allclose(
+        data.columns(few, acting, count), data.columns(every), rtol=1e-12, atol=1e-12
+    )
