@@ -128,7 +128,7 @@ def _shared[S, T, R](
 
 
 #: What the processes of a search need to begin with.
-OF_A_SEARCH = (EARLY, "bayesoleo.discovery._loop", "bayesoleo._report.page", "corner")
+OF_A_SEARCH = (EARLY, "bayesoleo.discovery._loop", "bayesoleo._report.page")
 
 
 def start_ahead(modules: Sequence[str] = OF_A_SEARCH, jobs: int | None = None) -> None:

@@ -126,6 +126,9 @@ def draw_ahead(
     part : (str, int)
         Of a kind in :data:`WITHOUT_DRAWS` or :data:`OF_DRAWS`.
     """
+    # The largest figure needs it, and it brings all of ArviZ: that is loaded while nobody waits.
+    import corner  # noqa: F401
+
     kind, number = part
     drawn, failed = _draw(shared, (*(WITHOUT_DRAWS | OF_DRAWS)[kind], number))
     return None if failed else (part, drawn)

@@ -12,9 +12,8 @@ import cloudpickle
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
-from scipy import stats
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo._schema import LabelledResult, columns
 from bayesoleo._storage.result_files import provenance
 from bayesoleo._storage.resume import digest
@@ -501,7 +500,10 @@ class FunctionWork:
         slope = found.sensitivity[0]
         variance = np.einsum("nk,kl,nl->n", slope, point[schema.COVARIANCE].values, slope)
         variance = variance + (float(point[schema.VARIANCE].values[0]) if noise else 0.0)
-        mean, half = -found.residual[0], stats.norm.isf(0.5 * (1 - level)) * np.sqrt(variance)
+        mean, half = (
+            -found.residual[0],
+            distributions.norm.isf(0.5 * (1 - level)) * np.sqrt(variance),
+        )
         columns_ = {"mean": mean, "sd": np.sqrt(variance), "low": mean - half, "high": mean + half}
         place = next(iter(table))
         data_set = xr.Dataset(

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from scipy import stats
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo._session.function_work import (
     Call,
     FunctionFit,
@@ -231,7 +230,7 @@ def _score(
     together = _correlated_samples(left, slope.shape[1] + size)
     ratio = (fall / size) / max((total - fall) / freedom, np.finfo(float).tiny) / together
     freedom = max(freedom / together, 1.0)
-    local = float(stats.f.sf(ratio, size, freedom))
+    local = float(distributions.f.sf(ratio, size, freedom))
     p_value = float(-np.expm1(tests * np.log1p(-min(local, 1 - 1e-16))))
     return TermScore(term, expected, fall / total, p_value)
 

@@ -16,9 +16,8 @@ from functools import partial
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import stats
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo._schema import LabelledResult, columns, variable
 from bayesoleo._types import Array, Float
 from bayesoleo._workflow.predicted_starts import drawn_starts, estimated_starts, unknown_starts
@@ -313,7 +312,7 @@ def _one_run(
     noise = np.stack([_sd_of(name, known, record)[good] for name in predictor.outputs], axis=1)
     mean = y.mean(axis=0)
     spread = np.sqrt(y.var(axis=0) + np.mean(noise**2, axis=0)[:, None])
-    half = stats.norm.isf(0.5 * (1 - level)) * spread
+    half = distributions.norm.isf(0.5 * (1 - level)) * spread
     kept = slice(None) if record.kept is None else record.kept
     scores = [
         score_draws(record.samples[name][kept], y[:, b, kept], noise[:, b, None], level=level)

@@ -17,9 +17,8 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo._schema import LabelledResult, columns, variable
 from bayesoleo._types import Array
 from bayesoleo.assessment import _residual_tests as tests
@@ -110,13 +109,13 @@ def _runs_differ(chosen: Sequence[Series], means: Array) -> float:
     periods = [one.period_means() for one in chosen]
     free = sum(part.size - 1 for part in periods)
     if free == 0:
-        return float(stats.chi2.sf(chi_square, len(chosen) - 1))
+        return float(distributions.chi2.sf(chi_square, len(chosen) - 1))
     scatter = sum(
         w * np.sum((part - part.mean()) ** 2) / part.size
         for w, part in zip(weight, periods, strict=True)
     )
     ratio = chi_square / (len(chosen) - 1) / max(float(scatter) / free, _TINY)
-    return float(stats.f.sf(ratio, len(chosen) - 1, free))
+    return float(distributions.f.sf(ratio, len(chosen) - 1, free))
 
 
 def _groups_differ(means: Array, members: Sequence[Array]) -> tuple[float, float]:
@@ -125,7 +124,7 @@ def _groups_differ(means: Array, members: Sequence[Array]) -> tuple[float, float
     inside = float(sum(np.sum((part - part.mean()) ** 2) for part in members))
     between, free = len(members) - 1, means.size - len(members)
     ratio = (total - inside) / between / max(inside / free, _TINY)
-    return 1 - inside / max(total, _TINY), float(stats.f.sf(ratio, between, free))
+    return 1 - inside / max(total, _TINY), float(distributions.f.sf(ratio, between, free))
 
 
 def assess(

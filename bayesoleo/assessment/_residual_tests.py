@@ -17,8 +17,8 @@ from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import Array, Float
 from bayesoleo.data._fourier import integrated_time, lagged_products
 from bayesoleo.errors import InputError
@@ -76,7 +76,8 @@ def score_normal(
     Gneiting and Raftery (2007); Dawid (1984).
     """
     y, centre, spread = _aligned(measured, mean, sd)
-    return _score(stats.norm.logpdf(y, centre, spread), stats.norm.cdf(y, centre, spread), level)
+    log_density, pit = _normal(y, centre, spread)
+    return _score(log_density, pit, level)
 
 
 def score_draws(
@@ -105,9 +106,9 @@ def score_draws(
     if noise.shape == (len(many),) and len(many) != y.size:
         noise = noise[:, None]
     _, _, spread = _aligned(np.broadcast_to(y, many.shape), many, noise)
-    log_density = stats.norm.logpdf(y, many, spread)
+    log_density, pit = _normal(y, many, spread)
     mixture = np.logaddexp.reduce(log_density, axis=0) - np.log(len(many))
-    return _score(mixture, stats.norm.cdf(y, many, spread).mean(axis=0), level)
+    return _score(mixture, pit.mean(axis=0), level)
 
 
 def _aligned(measured: ArrayLike, mean: ArrayLike, sd: ArrayLike) -> tuple[Array, Array, Array]:
@@ -126,15 +127,25 @@ def _aligned(measured: ArrayLike, mean: ArrayLike, sd: ArrayLike) -> tuple[Array
     return y, centre, spread
 
 
+def _normal(y: Array, centre: Array, spread: Array) -> tuple[Array, Array]:
+    """Logarithm of the density and distribution function of normal values."""
+    z = (y - centre) / spread
+    return distributions.norm.logpdf(z) - np.log(spread), distributions.norm.cdf(z)
+
+
 def _score(log_density: Array, pit: Array, level: float) -> PredictiveScore:
     tail = (1 - level) / 2
     inside = (pit >= tail) & (pit <= 1 - tail)
+    # Kolmogorov's statistic: the distribution function of a sample has a step at each value.
+    step = np.arange(pit.size + 1) / pit.size
+    ascending = np.sort(pit)
+    distance = max(np.max(step[1:] - ascending), np.max(ascending - step[:-1]))
     return PredictiveScore(
         log_score=float(np.mean(log_density)),
         pit=pit,
         coverage=float(inside.mean()),
         level=level,
-        distance=float(stats.kstest(pit, "uniform").statistic),
+        distance=float(distance),
     )
 
 
@@ -170,14 +181,14 @@ def runs_of_signs(residual: Array) -> ResidualTest:
         return NOTHING
     if min(above, below) == 0:  # as many of each were to be expected, and one run came
         z = -np.sqrt(signs.size - 1)
-        return ResidualTest(float(z), float(2 * stats.norm.sf(-z)))
+        return ResidualTest(float(z), float(2 * distributions.norm.sf(-z)))
     runs = 1 + int((np.diff(signs) != 0).sum())
     mean = 1 + 2 * above * below / signs.size
     variance = (mean - 1) * (mean - 2) / (signs.size - 1)
     if variance <= 0:
         return NOTHING
     z = (runs - mean) / np.sqrt(variance)
-    return ResidualTest(float(z), float(2 * stats.norm.sf(abs(z))))
+    return ResidualTest(float(z), float(2 * distributions.norm.sf(abs(z))))
 
 
 def autocorrelation(values: Array, lags: int) -> Array:
@@ -232,7 +243,8 @@ def normality(residual: Array) -> tuple[float, float, ResidualTest]:
         Chi-square with two degrees of freedom.
     """
     n = residual.size
-    skewness, kurtosis = float(stats.skew(residual)), float(stats.kurtosis(residual))
+    skewness = float(distributions.skewness(residual))
+    kurtosis = float(distributions.kurtosis(residual)) - 3
     if n < 20 or not np.isfinite(skewness):
         return skewness, kurtosis, NOTHING
     rho = autocorrelation(residual, n - 1)
@@ -240,7 +252,7 @@ def normality(residual: Array) -> tuple[float, float, ResidualTest]:
     third = 1 + 2 * float(np.sum(rho[1:] ** 3))
     fourth = 1 + 2 * float(np.sum(rho[1:] ** 4))
     statistic = n * (skewness**2 / (6 * max(third, 1e-3)) + kurtosis**2 / (24 * fourth))
-    return skewness, kurtosis, ResidualTest(statistic, float(stats.chi2.sf(statistic, 2)))
+    return skewness, kurtosis, ResidualTest(statistic, float(distributions.chi2.sf(statistic, 2)))
 
 
 def intraclass_correlation(repeating: float, sigma: float, samples: int, number: int) -> float:
@@ -293,7 +305,7 @@ def lack_of_fit(
         return NOTHING
     ratio = repeating**2 / noise
     free = number / effective, (samples - number) / effective
-    return ResidualTest(float(ratio), float(stats.f.sf(ratio, *free)))
+    return ResidualTest(float(ratio), float(distributions.f.sf(ratio, *free)))
 
 
 def outliers(values: Array, level: float = 0.05) -> tuple[Array, NDArray[np.int64], float]:
@@ -318,7 +330,7 @@ def outliers(values: Array, level: float = 0.05) -> tuple[Array, NDArray[np.int6
     centre = float(np.median(values))
     # The median absolute deviation of a standard normal is 0.6745.
     spread = float(np.median(np.abs(values - centre))) / 0.6744897501960817
-    limit = float(stats.norm.isf(level / (2 * values.size)))
+    limit = float(distributions.norm.isf(level / (2 * values.size)))
     if spread == 0:
         return np.zeros(values.size), np.zeros(0, dtype=np.int64), limit
     scores = (values - centre) / spread
@@ -381,5 +393,5 @@ def dependence(residual: Array, variable: Array, effective: float, bins: int = B
         means,
         errors,
         share,
-        ResidualTest(ratio, float(stats.f.sf(ratio, count - 1, free))),
+        ResidualTest(ratio, float(distributions.f.sf(ratio, count - 1, free))),
     )

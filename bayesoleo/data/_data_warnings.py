@@ -14,8 +14,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft, stats
+from scipy import fft
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import Array
 from bayesoleo.data._fourier import HarmonicBasis, basis_of
 from bayesoleo.data._harmonics import foreign_lines
@@ -78,7 +79,7 @@ class Drift:
     def p_value(self) -> float:
         """Probability of a trend as large, of mean or amplitude, in a record without one."""
         scores = abs(self.mean) / self.mean_sd, abs(self.amplitude) / self.amplitude_sd
-        return min(1.0, float(2 * 2 * stats.norm.sf(max(scores))))
+        return min(1.0, float(2 * 2 * distributions.norm.sf(max(scores))))
 
     @property
     def change(self) -> float:

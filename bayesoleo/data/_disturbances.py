@@ -30,8 +30,9 @@ from dataclasses import replace
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
-from scipy import optimize, stats
+from scipy import optimize
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import Array
 from bayesoleo.data._fourier import HarmonicBasis
 from bayesoleo.data._harmonics import (
@@ -245,7 +246,7 @@ def _is_resolved(basis: HarmonicBasis, values: Array) -> bool:
     power = np.abs(coefficients[fast]) ** 2 / (2.0 * np.maximum(variances[fast], 1e-300))
     # As many lines between the harmonics have told the noise, each of a pair of coefficients.
     free = (basis.samples - basis.size) // 2
-    return bool(stats.f.sf(power.mean(), 2 * power.size, max(free, 2)) > _FURTHER)
+    return bool(distributions.f.sf(power.mean(), 2 * power.size, max(free, 2)) > _FURTHER)
 
 
 # -- drift -----------------------------------------------------------------------------------------
@@ -266,7 +267,8 @@ def drifts(basis: HarmonicBasis, values: Array, periods: int, level: float) -> b
     ratio = float(np.mean(coefficients[:tested] ** 2)) / noise
     change = float(np.ptp(terms @ coefficients))
     return bool(
-        stats.f.sf(ratio, tested, 2 * lines) < level and change > LEAST_SHARE * np.ptp(values)
+        distributions.f.sf(ratio, tested, 2 * lines) < level
+        and change > LEAST_SHARE * np.ptp(values)
     )
 
 
@@ -299,7 +301,7 @@ def _drift(basis: HarmonicBasis, values: Array, periods: int) -> tuple[Array, in
     number = min(_TESTED, size)
     while number < size:
         rest = coefficients[number : number + _TESTED]
-        if not stats.f.sf(np.mean(rest**2) / level, rest.size, 2 * lines) < _FURTHER:
+        if not distributions.f.sf(np.mean(rest**2) / level, rest.size, 2 * lines) < _FURTHER:
             break
         number += 1
     return _fitted_drift(basis, number, values), number
@@ -386,7 +388,7 @@ def _stands_out(
     dispersion = max(1.0, float(np.sum((ratios - 1.0) ** 2)) / max(ratios.size - 2, 1))
     highest = float(before[max(centre - 1, 0) : centre + 2].max())
     return all(
-        stats.f.sf(highest / mean, 2, 2 * side.size / dispersion) < level
+        distributions.f.sf(highest / mean, 2, 2 * side.size / dispersion) < level
         for side, mean in zip((below, above), means, strict=True)
     )
 
@@ -449,7 +451,7 @@ def _kurtosis_p(rest: Array) -> float:
     correlation = correlation / correlation[0]
     # Fourth powers of correlated normal variates scatter as fewer independent ones.
     count = max(size / (1.0 + 2.0 * float(np.sum(correlation[1:] ** 4))), 20.0)
-    value = float(stats.kurtosis(rest, fisher=False))
+    value = float(distributions.kurtosis(rest))
     mean = 3.0 * (count - 1) / (count + 1)
     variance = 24.0 * count * (count - 2) * (count - 3)
     variance /= (count + 1) ** 2 * (count + 3) * (count + 5)
@@ -459,7 +461,7 @@ def _kurtosis_p(rest: Array) -> float:
     a = 6.0 + 8.0 / skew * (2.0 / skew + np.sqrt(1.0 + 4.0 / skew**2))
     ratio = (1.0 - 2.0 / a) / (1.0 + x * np.sqrt(2.0 / (a - 4.0)))
     z = (1.0 - 2.0 / (9.0 * a) - np.cbrt(ratio)) / np.sqrt(2.0 / (9.0 * a))
-    return float(stats.norm.sf(z))
+    return float(distributions.norm.sf(z))
 
 
 def _repeating(basis: HarmonicBasis, values: Array, cleaned: Array) -> Array:
@@ -524,7 +526,9 @@ def _student_t(rest: Array) -> tuple[float, float]:
         for _ in range(30):  # expectation maximisation
             weight = (degrees + 1) / (degrees + (rest / scale) ** 2)
             scale = float(np.sqrt(np.mean(weight * rest**2)))
-        density = float(np.sum(stats.t.logpdf(rest / scale, degrees))) - rest.size * np.log(scale)
+        density = float(np.sum(distributions.t.logpdf(rest / scale, degrees))) - rest.size * np.log(
+            scale
+        )
         best = max(best, (density, degrees, scale))
     return best[1], best[2]
 

@@ -40,9 +40,9 @@ from typing import Any, cast
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import fft, stats
+from scipy import fft
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo._schema import variable
 from bayesoleo._types import Array, ComplexArray, Flags, Integers
 from bayesoleo.data._campaign import CampaignData
@@ -709,7 +709,7 @@ def _survival(measured: Array, expected: Array, each: float, free: Array) -> Arr
     """Survival function of the ratio of two powers; NaN where either has no degrees of freedom."""
     known = (each > 0) & (free > 0) & np.isfinite(measured) & (expected > 0)
     ratio = np.divide(measured, expected, out=np.zeros_like(measured), where=known)
-    p = stats.f.sf(ratio, max(each, 1.0), np.where(known, free, 1.0))
+    p = distributions.f.sf(ratio, max(each, 1.0), np.where(known, free, 1.0))
     return np.where(known, p, np.nan)
 
 

@@ -17,8 +17,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage, stats
+from scipy import fft, ndimage
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import Array
 from bayesoleo.data._fourier import HarmonicBasis
 from bayesoleo.data._noise import periodic_average
@@ -266,7 +267,7 @@ def foreign_line(
     k = int(lines[best])
     amplitude = 2.0 * float(np.sqrt(power[k])) / left.size
     # A median scatters as a mean of half as many would: the ratio has nearly an F distribution.
-    p = float(-np.expm1(lines.size * np.log1p(-stats.f.sf(ratio[best], 2, _BESIDE))))
+    p = float(-np.expm1(lines.size * np.log1p(-distributions.f.sf(ratio[best], 2, _BESIDE))))
     return SpectralLine(
         channel, k / (left.size * time_step), amplitude, max(average.sigma, 1e-300), p
     )

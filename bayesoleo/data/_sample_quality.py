@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import Array
 from bayesoleo.data._fourier import HarmonicBasis, lagged_products
 from bayesoleo.errors import CampaignError
@@ -270,7 +270,7 @@ def _exceeds(power: float, rest: Array, length: int, share: float, level: float)
     usual = float(np.mean(rest**2))
     together = _samples_per_degree(rest)
     free = rest.size * (1.0 - share)
-    bound = stats.f.isf(level, max(length / together, 1.0), max(free / together, 1.0))
+    bound = distributions.f.isf(level, max(length / together, 1.0), max(free / together, 1.0))
     others = rest[: rest.size // length * length].reshape(-1, length)
     worst = float(np.max(np.mean(others**2, axis=1)))
     return power > max(bound, 1.0 + LEAST_EXCESS) * usual and power > worst

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.fft
-from scipy import linalg, signal
+from scipy import linalg
 
 from bayesoleo._types import Array, Flags
 from bayesoleo.discovery._fit import ModelFit
@@ -82,6 +82,9 @@ def _best_gain(rows: Array, residual: Array) -> float:
 
 def _window(run: RunNoise) -> Array:
     """Weights of the samples that fall to zero at both ends."""
+    # Only transients need it, and loading it takes as long as much of a search of periodic runs.
+    from scipy import signal
+
     return np.asarray(signal.windows.tukey(run.samples, 2.0 * END))
 
 

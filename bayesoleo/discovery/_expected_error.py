@@ -30,8 +30,8 @@ from typing import cast
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
-from scipy import stats
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import Array
 from bayesoleo.data._noise import local_means
 from bayesoleo.discovery._fit import ModelFit
@@ -365,7 +365,7 @@ def expected_of_held_out(
 
 def most_by_chance(square: float, policy: SearchPolicy) -> float:
     """What chance makes of a mean square by errors of the unknowns at most, were they one."""
-    return square * float(stats.chi2.isf(policy.floor_false_alarm, 1))
+    return square * float(distributions.chi2.isf(policy.floor_false_alarm, 1))
 
 
 def _own_response(

@@ -24,8 +24,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array
 from bayesoleo.data._noise import (
@@ -338,7 +338,7 @@ def _feigned(
     if not isinstance(average, LocalAverage):
         return np.inf
     scatter = average.sigma**2 * np.sqrt(2.0 / counted(record) + 2.0 / average.free)
-    chance = float(stats.norm.isf(policy.floor_false_alarm))
+    chance = float(distributions.norm.isf(policy.floor_false_alarm))
     return float(chance * scatter + by_input**2)
 
 
@@ -473,7 +473,7 @@ def lowest(
     noise = [replace(e, parameters=none, own_share=e.own_share / own) for e in entries]
     share, number, free = _variate(noise)
     level = policy.floor_false_alarm / tests
-    square = 1.0 + share * (float(stats.f.ppf(level, number, free)) - 1.0)
+    square = 1.0 + share * (float(distributions.f.ppf(level, number, free)) - 1.0)
     return math.sqrt(own * max(square, 0.0))
 
 
@@ -487,13 +487,13 @@ def chance(entries: Sequence[RunError]) -> float:
     """
     square = float(np.mean([entry.ratio_to_expected**2 for entry in entries]))
     share, number, free = _variate(entries)
-    return float(stats.f.sf(1.0 + (square - 1.0) / share, number, free))
+    return float(distributions.f.sf(1.0 + (square - 1.0) / share, number, free))
 
 
 def _quantile(entries: Sequence[RunError], above: float) -> float:
     """Squared ratio that is exceeded with this probability."""
     share, number, free = _variate(entries)
-    return 1.0 + share * (float(stats.f.isf(above, number, free)) - 1.0)
+    return 1.0 + share * (float(distributions.f.isf(above, number, free)) - 1.0)
 
 
 def _variate(entries: Sequence[RunError]) -> tuple[float, float, float]:

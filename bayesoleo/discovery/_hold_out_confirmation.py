@@ -14,8 +14,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import Array, ProgressCallback
 from bayesoleo.data._noise import NoiseSpectrum
 from bayesoleo.discovery._assembly import Roles, in_halves
@@ -83,7 +83,7 @@ class Fall:
     @property
     def undecided(self) -> bool:
         """Whether these runs would probably not confirm even a real effect."""
-        missed = stats.norm.isf(self.policy.missed_confirmation)
+        missed = distributions.norm.isf(self.policy.missed_confirmation)
         least = self.policy.confirming_errors * self.error + missed * self.scatter
         return bool(self.expected < least)
 

@@ -19,8 +19,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._alternatives import Loss, compared_without, loss_of
 from bayesoleo.discovery._assembly import AddedEffect, Roles
@@ -78,16 +78,18 @@ class Evidence:
         """The p-value on the fitted runs, corrected for the search."""
         loss, noise = self.loss, self.loss.noise
         if noise.freedom:
-            local = stats.f.sf(loss.rise / noise.value / loss.size, loss.size, noise.freedom)
+            local = distributions.f.sf(
+                loss.rise / noise.value / loss.size, loss.size, noise.freedom
+            )
         else:
-            local = stats.chi2.sf(loss.rise / noise.value, loss.size)
+            local = distributions.chi2.sf(loss.rise / noise.value, loss.size)
         return float(-np.expm1(self.tests * np.log1p(-min(local, 1 - 1e-16))))
 
     @property
     def missing(self) -> float:
         """Standard errors by which an effect misses what keeps it; none below zero."""
-        asked = stats.norm.isf(self.policy.significance)
-        fitted = float(asked - stats.norm.isf(max(self.p, 1e-300)))
+        asked = distributions.norm.isf(self.policy.significance)
+        fitted = float(asked - distributions.norm.isf(max(self.p, 1e-300)))
         if self.by_others is None:
             return fitted
         if self.by_others.confirms:

@@ -32,7 +32,6 @@ from typing import cast
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import logsumexp, ndtr, ndtri
-from scipy.stats import qmc
 
 from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.discovery._fit import ModelFit
@@ -172,6 +171,8 @@ class Coordinates:
         ndarray, shape (count,)
             Logarithms of weights, whose mean is the evidence over that with the normal parts.
         """
+        from scipy.stats import qmc  # as in :func:`_normal_nodes`
+
         sd = np.sqrt(np.diag(covariance))
         special = self.rough(mean, sd)
         taken = special & ~np.array([_kind(prior) is Correlated for prior in self.priors])

@@ -17,9 +17,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy import stats
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo._first_compilation import has_others
 from bayesoleo._parallel import single_blas_thread
 from bayesoleo._types import ProgressCallback
@@ -278,7 +277,7 @@ class ClosedLoop:
             return False
         local = -np.expm1(np.log1p(-level) / last.tests)
         fall = estimate.fall / estimate.inflation
-        return bool((1.0 - same) * fall > stats.chi2.isf(local, 1))
+        return bool((1.0 - same) * fall > distributions.chi2.isf(local, 1))
 
     def _has_sibling(self, found: Ranked) -> bool:
         """Whether another effect of the same family and place leaves only noise too."""

@@ -18,8 +18,8 @@ from itertools import pairwise
 
 import numpy as np
 import scipy.fft
-from scipy import stats
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import Array
 from bayesoleo.discovery._expected_error import LinearisedRun, expected_of_fitted, linearised_runs
 from bayesoleo.discovery._fit import ModelFit
@@ -174,7 +174,7 @@ def flatness_p(lines: Sequence[Array]) -> float:
         if band.size and others:
             # Beside the mean of all other lines: one that holds nearly all power is seen too.
             mean = max((rest - float(band.sum())) / others, 1e-300)
-            chance = stats.f.sf(float(band.mean()) / mean, 2 * band.size, 2 * others)
+            chance = distributions.f.sf(float(band.mean()) / mean, 2 * band.size, 2 * others)
             least = min(least, float(chance))
     return min(least * (edges.size - 1), 1.0)
 

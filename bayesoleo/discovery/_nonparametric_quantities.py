@@ -16,7 +16,6 @@ from typing import Any, cast
 
 import numpy as np
 import sympy as sp
-from scipy import stats
 
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Assembly
@@ -229,7 +228,14 @@ def times_direction(turns: Motions | None, r: int, phase: Array, values: Array) 
 
 
 def _rank_correlation(values: Array, other: Array) -> float:
-    return float(abs(stats.spearmanr(values, other).statistic))
+    """Size of Spearman's rank correlation."""
+    return float(abs(np.corrcoef(_ranks(values), _ranks(other))[0, 1]))
+
+
+def _ranks(values: Array) -> Array:
+    """Ranks from one, equal values with the average of theirs."""
+    _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
+    return np.asarray((np.cumsum(counts) - (counts - 1) / 2)[place])
 
 
 def _driven(assembly: Assembly, item: ModelQuantity) -> sp.Expr | None:

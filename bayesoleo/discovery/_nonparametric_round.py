@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy import stats
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import AddedEffect, Roles
 from bayesoleo.discovery._fit import ModelFit
@@ -228,7 +228,7 @@ def _is_better(fine: _Answer, coarse: _Answer) -> bool:
     least = min(fine.refit.inflation, coarse.refit.inflation)
     gained = (fine.refit.fall - coarse.refit.fall) / least
     more = fine.refit.size - coarse.refit.size
-    p_value = float(stats.chi2.sf(gained, more))
+    p_value = float(distributions.chi2.sf(gained, more))
     return _goes_on(coarse.merit, fine.merit, p_value, fine.refit.policy)
 
 

@@ -19,8 +19,9 @@ from functools import cache, partial
 import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._parallel import thread_map
 from bayesoleo._types import Array
 from bayesoleo.discovery._assembly import Assembly
@@ -254,7 +255,7 @@ def _refined(group: Sequence[Tried], level: float) -> Tried:
         more = finer.rank - chosen.rank
         if finer.pieces > chosen.pieces and more > 0:
             fall = (finer.fall - chosen.fall) / max(chosen.inflation, finer.inflation)
-            if stats.chi2.sf(fall, more) < level:
+            if distributions.chi2.sf(fall, more) < level:
                 chosen = finer
     return chosen
 
@@ -264,9 +265,9 @@ def corrected(item: Tried, tests: int) -> float:
     statistic = item.fall / item.inflation
     if item.inflation > 1.0 and item.freedom > 0:
         # The noise was measured between few periods, and is itself uncertain.
-        local = float(stats.f.sf(statistic / item.rank, item.rank, item.freedom))
+        local = float(distributions.f.sf(statistic / item.rank, item.rank, item.freedom))
     else:
-        local = float(stats.chi2.sf(statistic, item.rank))
+        local = float(distributions.chi2.sf(statistic, item.rank))
     return float(-np.expm1(tests * np.log1p(-min(local, 1 - 1e-16))))
 
 
@@ -429,7 +430,7 @@ def _judged(
     inflation, freedom = inflation_of(base, directions)
     rank = found.weights.shape[1]
     statistic = found.fall / inflation
-    log_p = float(stats.chi2.logsf(statistic, rank))
+    log_p = float(distributions.chi2.logsf(statistic, rank))
     if not np.isfinite(log_p):
         log_p = -0.5 * statistic + 0.5 * rank * np.log(max(statistic / rank, 1.0))
     thin = [d[run.chosen] for run, d in zip(base.runs, directions, strict=True)]

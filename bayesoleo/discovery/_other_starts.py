@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import cast
 
 import numpy as np
-from scipy import stats
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import Array
 from bayesoleo.discovery._policy import SearchPolicy
 from bayesoleo.estimation._campaign_problem import CampaignProblem
@@ -34,7 +34,9 @@ def doubtful(problem: CampaignProblem, point: PointEstimate, policy: SearchPolic
         away = np.where(
             scale.logarithmic, np.log(point.theta / scale.mean), point.theta - scale.mean
         )
-    return bool(np.any(np.abs(away / scale.spread) > stats.norm.isf(policy.doubtful_prior / 2)))
+    return bool(
+        np.any(np.abs(away / scale.spread) > distributions.norm.isf(policy.doubtful_prior / 2))
+    )
 
 
 def from_other_starts(

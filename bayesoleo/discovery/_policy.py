@@ -12,7 +12,8 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from scipy import stats
+
+from bayesoleo import _distributions as distributions
 
 CHOICE, NOT_MEASURED = "a choice", "not measured"
 
@@ -369,7 +370,7 @@ class SearchPolicy:
     @property
     def confirming_errors(self) -> float:
         """Number of standard errors that a fall of the hold-out error must exceed."""
-        return float(stats.norm.isf(self.false_confirmation))
+        return float(distributions.norm.isf(self.false_confirmation))
 
 
 def _rows() -> Iterator[str]:

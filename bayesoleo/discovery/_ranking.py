@@ -16,8 +16,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import integrate, ndimage, optimize, stats
+from scipy import integrate, ndimage, optimize
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import Array, ProgressCallback
 from bayesoleo.data._harmonics import FALSE_ALARM
 from bayesoleo.discovery._assembly import Assembly, Option
@@ -91,13 +92,13 @@ def line_of(values: Array, inputs: Sequence[Array], step: float) -> tuple[float,
     for item in inputs:
         level = _over_level(item)
         if level is not None:
-            strong = level > stats.f.isf(FALSE_ALARM, 2, _BESIDE)
+            strong = level > distributions.f.isf(FALSE_ALARM, 2, _BESIDE)
             shared |= ndimage.binary_dilation(strong, iterations=_WIDE)
     own[shared] = 0.0
     k = int(np.argmax(own))
     if own[k] == 0:
         return None
-    p = float(-np.expm1(own.size * np.log1p(-stats.f.sf(own[k], 2, _BESIDE))))
+    p = float(-np.expm1(own.size * np.log1p(-distributions.f.sf(own[k], 2, _BESIDE))))
     return p, _refined(values, k) / (values.size * step)
 
 

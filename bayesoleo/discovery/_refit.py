@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
-from scipy import stats
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import Array
 from bayesoleo._worker_processes import process_map
 from bayesoleo.discovery._assembly import Assembly
@@ -219,11 +219,15 @@ class Refit:
             return False
         free = self.noise.freedom or np.inf
         if len(index) == 1:
-            return bool(stats.t.cdf(abs(value[0]) / np.sqrt(covariance[0, 0]), free) >= level)
+            return bool(
+                distributions.t.cdf(abs(value[0]) / np.sqrt(covariance[0, 0]), free) >= level
+            )
         distance = squared_distance(value, covariance)
         if self.noise.freedom:
-            return bool(stats.f.cdf(distance / len(index), len(index), free) >= 2 * level - 1)
-        return bool(stats.chi2.cdf(distance, len(index)) >= 2 * level - 1)
+            return bool(
+                distributions.f.cdf(distance / len(index), len(index), free) >= 2 * level - 1
+            )
+        return bool(distributions.chi2.cdf(distance, len(index)) >= 2 * level - 1)
 
 
 def refit(base: Base, score: Score, numerics: Numerics) -> Refit:

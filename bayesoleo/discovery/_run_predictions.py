@@ -18,8 +18,8 @@ from itertools import pairwise
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
-from scipy import stats
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import Array, Float
 from bayesoleo.data._noise import innovation_noise
 from bayesoleo.discovery._assembly import RecordNoise, halves
@@ -77,7 +77,7 @@ def borne_out(
             count = _of_draws if drawn else _coefficients
             coefficients = count(lines[:, band])
             level = policy.noise_false_alarm / policy.noise_bands
-            low = float(stats.chi2.ppf(level, coefficients)) / coefficients
+            low = float(distributions.chi2.ppf(level, coefficients)) / coefficients
             ratio = float(there[band].sum() / power[band].sum())
             least = min(least, ratio / max(low, 1e-300))
     return float(np.sqrt(least))

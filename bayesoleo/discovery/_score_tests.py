@@ -21,8 +21,8 @@ from itertools import product
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from scipy import stats
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._parallel import single_blas_thread
 from bayesoleo._types import Array
 from bayesoleo._worker_processes import process_map
@@ -83,7 +83,7 @@ def inflation_of(base: Base, directions: Sequence[Array]) -> tuple[float, int]:
     freedom = variance**2 / scatter if scatter > 0 else ASSUMED
     between, degrees = _between_periods(base.runs, directions)
     # Against the spectrum's own uncertainty: neither is exact.
-    unsteady = degrees > 0 and between / variance > stats.f.isf(
+    unsteady = degrees > 0 and between / variance > distributions.f.isf(
         base.policy.unsteady, degrees, freedom
     )
     if unsteady:
@@ -464,7 +464,7 @@ def effective_tests(
         root = vectors * np.sqrt(np.clip(values, 0.0, None))
         draws = np.random.default_rng(seed).standard_normal((policy.search_draws, values.size))
         largest = np.abs(draws @ root.T).max(axis=1)
-    smallest_p = 2 * stats.norm.sf(np.median(largest))
+    smallest_p = 2 * distributions.norm.sf(np.median(largest))
     return float(max(1.0, np.log(0.5) / np.log1p(-smallest_p)))
 
 
@@ -485,9 +485,9 @@ def corrected_p(score: Score, tests: float) -> float:
     """p-value of a score for the best of ``tests`` independent ones."""
     if score.inflation > 1.0 and score.freedom > 0:
         # The noise was measured between few periods, and is itself uncertain.
-        local = float(stats.f.sf(score.statistic / score.rank, score.rank, score.freedom))
+        local = float(distributions.f.sf(score.statistic / score.rank, score.rank, score.freedom))
     else:
-        local = float(stats.chi2.sf(score.statistic, score.rank))
+        local = float(distributions.chi2.sf(score.statistic, score.rank))
     one_sided = score.rank == 1 and any(score.option.candidate.sign.values())
     local = local / 2 if one_sided and score.fall > 0 else local
     return float(-np.expm1(tests * np.log1p(-min(local, 1 - 1e-16))))

@@ -12,9 +12,10 @@ from functools import cached_property, partial
 
 import numpy as np
 import scipy.fft
-from scipy import optimize, stats
+from scipy import optimize
 from scipy.special import expit
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import Array, Flags
 from bayesoleo._worker_processes import process_map
 from bayesoleo.data._noise import HARMONICS, PeriodicAverage, noise_spectrum, periodic_average
@@ -184,7 +185,7 @@ def colour_of(lines: Sequence[Lines]) -> tuple[tuple[float, float], float]:
     bounds = [(-8.0, 12.0), (np.log(0.2), np.log(1e4))]
     found = [optimize.minimize(cost, x, jac=True, method="L-BFGS-B", bounds=bounds) for x in starts]
     best = min(found, key=lambda one: float(one.fun))
-    p_value = float(stats.chi2.sf(2 * max(white - float(best.fun), 0.0), 2))
+    p_value = float(distributions.chi2.sf(2 * max(white - float(best.fun), 0.0), 2))
     share = MOST_SHARE * float(expit(best.x[0]))
     return (share, step * float(np.exp(best.x[1]))), p_value
 
@@ -235,7 +236,7 @@ def slow_lines_p(lines: Sequence[Sequence[tuple[Array, float]]]) -> float:
         free = sum(own for _, own in runs)
         for count in LEADING:
             some = np.concatenate([power[:count] for power, _ in runs])
-            chances.append(float(stats.f.sf(some.mean(), 2 * some.size, free)))
+            chances.append(float(distributions.f.sf(some.mean(), 2 * some.size, free)))
     return min(chances)
 
 

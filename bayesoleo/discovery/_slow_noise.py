@@ -12,8 +12,8 @@ from itertools import pairwise
 
 import numpy as np
 import scipy.fft
-from scipy import stats
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import Array
 from bayesoleo.discovery._fit_and_hold_out_error import limit
 from bayesoleo.discovery._run_predictions import Prediction
@@ -103,6 +103,6 @@ def _least_p(whitened: Sequence[Array]) -> float:
     for low, high in pairwise(edges):
         band = np.concatenate([one[low:high] for one in whitened])
         # Each mean of a pair of lines has two degrees of freedom.
-        lower = stats.chi2.cdf(2.0 * band.sum(), 2 * band.size)
+        lower = distributions.chi2.cdf(2.0 * band.sum(), 2 * band.size)
         least = min(least, 2.0 * float(min(lower, 1.0 - lower)))
     return min(least * (edges.size - 1), 1.0)

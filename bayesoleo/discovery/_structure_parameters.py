@@ -26,7 +26,6 @@ from itertools import product
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import logsumexp, ndtri
-from scipy.stats import qmc
 
 from bayesoleo._types import Array, Flags, Integers
 from bayesoleo.discovery._assembly import Added
@@ -586,6 +585,8 @@ def _by_side(
 def _normal_nodes(count: int) -> tuple[Array, Array]:
     """Points and weights of a normal density with unit variances."""
     if count > 2:
+        from scipy.stats import qmc  # few structures need it, and importing it takes half a second
+
         points = ndtri(qmc.Sobol(count, seed=0).random(NODES[2]))
         return points, np.full(NODES[2], 1.0 / NODES[2])
     line = np.linspace(-REACH, REACH, NODES[count - 1])

@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
-from scipy import stats
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo.discovery._curves import CurveFacts
 from bayesoleo.discovery._fit_and_hold_out_error import limit, lowest
 from bayesoleo.discovery._loop import ON_LIMIT, ClosedLoop
@@ -375,7 +374,7 @@ def _are_zero_together(state: State, names: Sequence[str], samples: Samples | No
         mean, covariance = rows.mean(axis=0), np.cov(rows, rowvar=False)
     if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
         return False
-    return bool(squared_distance(mean, covariance) <= stats.chi2.isf(0.05, len(names)))
+    return bool(squared_distance(mean, covariance) <= distributions.chi2.isf(0.05, len(names)))
 
 
 def _includes_zero(parameter: Mapping[str, Any]) -> bool:

@@ -14,8 +14,8 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
-from scipy import stats
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._types import ProgressCallback
 from bayesoleo.discovery._assembly import Roles
 from bayesoleo.discovery._hold_out_confirmation import (
@@ -102,7 +102,7 @@ def _may_be(result: Refit) -> bool:
 
 def _confirms(fall: Fall) -> bool:
     """Whether the fall by two effects is significant, although a few pairs are tried."""
-    enough = float(stats.norm.isf(fall.policy.false_confirmation / MOST))
+    enough = float(distributions.norm.isf(fall.policy.false_confirmation / MOST))
     return bool(fall.value > max(enough * fall.error, 2.0 * enough**2))
 
 

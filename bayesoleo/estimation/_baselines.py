@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import xarray as xr
-from scipy import stats
 
+from bayesoleo import _distributions as distributions
 from bayesoleo._schema import UNIT
 from bayesoleo._types import Array
 from bayesoleo.data._disturbances import baseline_of
@@ -102,7 +102,7 @@ def _scatter(means: Sequence[float]) -> float:
     """Standard deviation between runs, widened by how few there are; infinite of one."""
     if len(means) < 2:
         return np.inf
-    widened = stats.t.isf(0.025, len(means) - 1) / stats.norm.isf(0.025)
+    widened = distributions.t.isf(0.025, len(means) - 1) / distributions.norm.isf(0.025)
     return float(widened * np.std(means, ddof=1))
 
 

@@ -26,9 +26,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
-from scipy import optimize, stats
+from scipy import optimize
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo._types import Array, Float
 from bayesoleo.errors import InputError
 from bayesoleo.estimation._per_run import check_definite, comparable
@@ -83,8 +83,8 @@ def spread_interval(y: Array, variance: Array, level: float) -> tuple[tuple[floa
             high *= 4.0
         return float(np.sqrt(optimize.brentq(lambda t: q(t) - target, 0.0, high, xtol=1e-14)))
 
-    low, high = (stats.chi2.ppf(p, freedom) for p in (0.5 + 0.5 * level, 0.5 - 0.5 * level))
-    return (crossing(low), crossing(high)), float(stats.chi2.sf(q(0.0), freedom))
+    low, high = (distributions.chi2.ppf(p, freedom) for p in (0.5 + 0.5 * level, 0.5 - 0.5 * level))
+    return (crossing(low), crossing(high)), float(distributions.chi2.sf(q(0.0), freedom))
 
 
 @dataclass(frozen=True)
@@ -277,7 +277,7 @@ def pooled(
     r, (N, n) = y - mean, y.shape
     # Refined by the standardised scatter, whose expectation is one.
     C_refined = C * np.einsum("ni,nij,nj->", r, W, r) / (n * (N - 1))
-    quantile = stats.t.ppf(0.5 + 0.5 * level, N - 1)
+    quantile = distributions.t.ppf(0.5 + 0.5 * level, N - 1)
     half = quantile * np.sqrt(np.diag(C_refined))
     pull = T @ W
     rest = np.eye(n) - pull

@@ -23,10 +23,9 @@ from typing import cast
 
 import numpy as np
 import xarray as xr
-from scipy import stats
 from scipy.interpolate import PchipInterpolator
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo._schema import LabelledResult
 from bayesoleo._types import Array, Integers
 from bayesoleo.errors import InputError, check_level, check_names
@@ -326,7 +325,7 @@ def indifference(
     chosen = _pairs(problem, pairs)
     if epsilon is None:
         check_level(level)
-        epsilon = 0.5 * float(stats.chi2.isf(1 - level, 2))
+        epsilon = 0.5 * float(distributions.chi2.isf(1 - level, 2))
     if not epsilon > 0 or points < 8 or points % 2:
         hint = "epsilon must be positive, points an even number from eight"
         raise InputError("no contour can be drawn", value=(epsilon, points), hint=hint)

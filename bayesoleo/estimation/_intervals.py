@@ -14,9 +14,8 @@ from typing import Literal
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
-from scipy import stats
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo._schema import LabelledResult, columns
 from bayesoleo._types import Array
 from bayesoleo.error_models._fitting import LinearisedResidual, inverse_gram
@@ -257,7 +256,7 @@ def linearised_intervals(
     covariance = linearised_covariance(problem, point, form, prior=prior, exact=exact)
     names = [*point.names, *(f"variance[{output}]" for output in point.outputs)]
     values = np.concatenate((point.theta, point.variance))
-    half = stats.norm.isf((1 - level) / 2) * np.sqrt(np.diag(covariance))
+    half = distributions.norm.isf((1 - level) / 2) * np.sqrt(np.diag(covariance))
     size = point.theta.size
     shared = supported_ends(problem.priors, point.theta, half[:size])
     positive = point.variance * np.exp(np.outer([-1.0, 1.0], half[size:] / point.variance))
@@ -316,7 +315,11 @@ def over_experiments(
         )
     mean, covariance = table.mean(axis=0), np.atleast_2d(np.cov(table, rowvar=False))
     tail = (1 - level) / 2
-    factor = stats.t.isf(tail, count - 1) if distribution == "t" else stats.norm.isf(tail)
+    factor = (
+        distributions.t.isf(tail, count - 1)
+        if distribution == "t"
+        else distributions.norm.isf(tail)
+    )
     share = 1 / count if of == "mean" else 1 + 1 / count
     half = factor * np.sqrt(share * np.diag(covariance))
     data = _dataset(labels, mean, covariance, mean - half, mean + half)

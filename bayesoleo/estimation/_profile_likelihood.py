@@ -17,10 +17,9 @@ from typing import Literal
 
 import numpy as np
 import xarray as xr
-from scipy import stats
 from scipy.interpolate import PchipInterpolator
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo._schema import LabelledResult, columns
 from bayesoleo._types import Array, Float
 from bayesoleo.error_models._independent import output_counts, staged_variance
@@ -192,7 +191,7 @@ def profile(
     check_names(chosen, problem.names, "names", example=f'write ["{problem.names[0]}"]')
     chosen = list(chosen)
     drop = LogLikelihoodRatio(problem, point, kind)
-    limit = float(np.sqrt(stats.chi2.isf(1 - level, 1)))
+    limit = float(np.sqrt(distributions.chi2.isf(1 - level, 1)))
     covariance = point.covariance if drop.kind == "posterior" else point.covariance_likelihood
     lines = []
     for name in chosen:

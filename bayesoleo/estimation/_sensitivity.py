@@ -14,9 +14,8 @@ from typing import Any, Literal, cast
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
-from scipy import stats
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo._schema import LabelledResult, columns, variable
 from bayesoleo._types import Array
 from bayesoleo.errors import InputError
@@ -259,6 +258,8 @@ def sobol(
     ----------
     Sobol (2001); Saltelli et al. (2010), by ``scipy.stats.sobol_indices``.
     """
+    from scipy import stats  # what needs it is rare, and importing it takes half a second
+
     if samples < 8 or samples & (samples - 1):
         raise InputError(
             "samples must be a power of two", key="samples", value=samples, hint="use 1024"
@@ -304,14 +305,13 @@ def quantile(prior: Prior, part: ArrayLike) -> Array:
     """Value below which a part of the prior lies, any shape."""
     u = np.asarray(part, dtype=float)
     if isinstance(prior, Normal):
-        return cast(Array, stats.norm.ppf(u, prior.centre, prior.spread))
+        return cast(Array, prior.centre + prior.spread * distributions.norm.ppf(u))
     if isinstance(prior, Uniform):
         return prior.low + (prior.high - prior.low) * u
     if isinstance(prior, LogNormal):
-        return cast(Array, prior.median * np.exp(prior.log_spread * stats.norm.ppf(u)))
+        return cast(Array, prior.median * np.exp(prior.log_spread * distributions.norm.ppf(u)))
     if isinstance(prior, TruncatedNormal):
-        ends = ((end - prior.centre) / prior.spread for end in (prior.low, prior.high))
-        return cast(Array, stats.truncnorm.ppf(u, *ends, loc=prior.centre, scale=prior.spread))
+        return prior.quantile(u)
     # A prior of one's own has draws at least.
     return cast(Array, np.quantile(prior.sample(np.random.default_rng(0), _DRAWS), u))
 

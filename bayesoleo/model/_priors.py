@@ -268,15 +268,32 @@ class TruncatedNormal:
         return np.where((value < self.low) | (value > self.high), -np.inf, inside)
 
     def sample(self, rng: np.random.Generator, size: int) -> Array:
-        # In the left tail the distribution function is a small number known to full precision.
-        sign = -1.0 if self._steepness > 0 else 1.0
-        bounds = (self.low - self.centre) / self.spread, (self.high - self.centre) / self.spread
-        low, high = sorted(sign * bound for bound in bounds)
         part = rng.uniform(size=size)
         with np.errstate(divide="ignore"):  # the logarithm of zero is minus infinity, as it should
-            logarithm = np.logaddexp(log_ndtr(low) + np.log1p(-part), log_ndtr(high) + np.log(part))
-        drawn = self.centre + self.spread * sign * ndtri_exp(logarithm)
-        return cast(Array, np.clip(drawn, self.low, self.high))
+            return self._between(np.log1p(-part), np.log(part))
+
+    def quantile(self, part: ArrayLike) -> Array:
+        """Value below which a part of the distribution lies, any shape."""
+        part = np.asarray(part, dtype=float)
+        with np.errstate(divide="ignore"):
+            parts = np.log1p(-part), np.log(part)
+        return self._between(*(parts if self._sign > 0 else parts[::-1]))
+
+    @property
+    def _sign(self) -> float:
+        """Minus one where the interval is turned over, into the left tail: there the distribution
+        function is a small number known to full precision."""
+        return -1.0 if self._steepness > 0 else 1.0
+
+    def _between(self, log_low: Array, log_high: Array) -> Array:
+        """Values from the logarithms of the shares that both bounds have, the more negative bound
+        first after the interval is turned."""
+        sign = self._sign
+        bounds = (self.low - self.centre) / self.spread, (self.high - self.centre) / self.spread
+        low, high = sorted(sign * bound for bound in bounds)
+        logarithm = np.logaddexp(log_ndtr(low) + log_low, log_ndtr(high) + log_high)
+        value = self.centre + self.spread * sign * ndtri_exp(logarithm)
+        return cast(Array, np.clip(value, self.low, self.high))
 
 
 class Shape(Enum):

@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from scipy import interpolate, stats
+from scipy import interpolate
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo._schema import LabelledResult
 from bayesoleo.errors import number_of
 from bayesoleo.plots import _style as style
@@ -80,7 +80,7 @@ def profile(found: LabelledResult | xr.Dataset | xr.DataTree) -> Figure:
     """
     data = dataset(found)
     names = [str(name) for name in data[schema.PARAMETER].values][:REGION_MOST]
-    level = stats.chi2.isf(1 - float(data.attrs["level"]), 1) / 2
+    level = distributions.chi2.isf(1 - float(data.attrs["level"]), 1) / 2
     figure, panels = panel_grid(len(names))
     for axes, name in zip(panels, names, strict=True):
         one = data.sel(parameter=name)
@@ -189,9 +189,10 @@ def sampling_distribution(found: LabelledResult | xr.Dataset | xr.DataTree) -> F
             np.clip(scaled, -WIDTHS, WIDTHS), np.linspace(-WIDTHS, WIDTHS, bins).tolist(),
             density=True, color=style.SIMILAR,
         )  # fmt: skip
-        axes.plot(grid, stats.norm.pdf(grid), color=style.AFTER, lw=1.6)
+        axes.plot(grid, distributions.norm.pdf(grid), color=style.AFTER, lw=1.6)
         expected = float(one["expected_sd"]) / unit
-        axes.plot(grid, stats.norm.pdf(grid, 0, expected), "--", color=style.BEFORE, lw=1.2)
+        density = distributions.norm.pdf(grid / expected) / expected
+        axes.plot(grid, density, "--", color=style.BEFORE, lw=1.2)
         axes.axvline(float(one["bias"]) / unit, color=style.INK, lw=0.8)
         style.dress(axes, 4)
         axes.set_yticks([])

@@ -11,9 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
-from scipy import stats
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo._types import Array
 from bayesoleo.errors import ResultsError, number_of
 from bayesoleo.plots import _reading as reading, _style as style
@@ -272,7 +271,7 @@ def pairs(tree: xr.DataTree) -> Figure:
         raise ResultsError("posterior and indifference region have no plane in common")
     # The shadow of the whole region, where it was made.
     data = data.isel(section=-1)
-    normal = float(stats.chi2.cdf(2 * float(data.attrs["epsilon"]), 2))
+    normal = float(distributions.chi2.cdf(2 * float(data.attrs["epsilon"]), 2))
     figure, panels = panel_grid(len(planes))
     for axes, (pair, names) in zip(panels, planes, strict=True):
         values = np.column_stack([draws(tree, name).ravel() for name in names])

@@ -12,9 +12,8 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from scipy import stats
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo._schema import LabelledResult
 from bayesoleo._types import Array
 from bayesoleo.assessment._assess import LAGS, correlograms, dependence_on, outliers_of
@@ -345,7 +344,7 @@ def _signs(axes: Axes, series: Series) -> None:
 def _normal(axes: Axes, series: Series) -> None:
     """Order statistics in standard deviations against those of a normal distribution."""
     size = series.residual.size
-    quantiles = stats.norm.ppf((np.arange(size) + 0.5) / size)
+    quantiles = distributions.norm.ppf((np.arange(size) + 0.5) / size)
     spread = max(float(series.residual.std()), np.finfo(float).tiny)
     axes.plot(quantiles, quantiles, color=style.INK, lw=0.6)
     axes.plot(

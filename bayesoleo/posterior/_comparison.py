@@ -38,9 +38,9 @@ from functools import lru_cache
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
-from scipy import linalg, stats
+from scipy import linalg
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo._schema import columns
 from bayesoleo._types import Array, Integers
 from bayesoleo.errors import InputError, ResultsError
@@ -120,8 +120,8 @@ def compare(groups: Mapping[str, xr.Dataset] | xr.DataTree) -> xr.Dataset:
                 np.array([*extremes, (np.nan, np.nan)]),
                 _about("posterior variance over the reference's, over all directions"),
             ),
-            "skewness": (each, stats.skew(draws, axis=1), _about("skewness")),
-            "excess_kurtosis": (each, stats.kurtosis(draws, axis=1), _about("excess kurtosis")),
+            "skewness": (each, distributions.skewness(draws), _about("skewness")),
+            "excess_kurtosis": (each, distributions.kurtosis(draws) - 3, _about("excess kurtosis")),
         },
         coords={
             schema.PARAMETER: names,
@@ -332,6 +332,8 @@ def uniformity(
     seed : int
         Of the simulation that finds it.
     """
+    from scipy import stats  # what needs it is rare, and importing it takes half a second
+
     ranks = np.asarray(ranks, dtype=np.int64)
     count, places = ranks.size, np.arange(1, draws + 1) / (draws + 1)
     counts = _counts(ranks[None], draws)
@@ -347,6 +349,8 @@ def uniformity(
 @lru_cache(maxsize=16)
 def _two_sided(count: int, draws: int) -> Array:
     """Binomial probabilities of so many ranks or further off, shape (count + 1, draws)."""
+    from scipy import stats  # as in :func:`uniformity`
+
     places = np.arange(1, draws + 1) / (draws + 1)
     number = np.arange(count + 1)[:, None]
     below = stats.binom.cdf(number, count, places)

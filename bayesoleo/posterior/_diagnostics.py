@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import stats
 
-from bayesoleo import _schema as schema
+from bayesoleo import _distributions as distributions, _schema as schema
 from bayesoleo._types import Array, Bool, Flags, Float, Int, Integers
 from bayesoleo.data._fourier import lagged_products
 from bayesoleo.posterior._checkpoints import REASONS
@@ -142,7 +141,7 @@ def rhat_limit(ensembles: int, size: float) -> float:
         At least 1.01. The squared R-hat exceeds one by chi-square / (ensembles - 1) over the
         effective draws of one ensemble; the limit is that variable's 99.9 % quantile.
     """
-    spread = stats.chi2.ppf(0.999, ensembles - 1) / (ensembles - 1)
+    spread = distributions.chi2.ppf(0.999, ensembles - 1) / (ensembles - 1)
     return float(max(1.01, np.sqrt(1 + spread * ensembles / size)))
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import astuple, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,16 +19,10 @@ from bayesoleo.estimation._campaign_problem import CampaignProblem
 from bayesoleo.estimation._problem import unwatched
 from bayesoleo.posterior._checkpoints import Segment, Store, open_store
 from bayesoleo.posterior._diagnostics import Samples, autocorrelation_time
-from bayesoleo.posterior._ensemble_moves import (
-    DistributedDensity,
-    Ensembles,
-    MoveWeights,
-    SharedDensity,
-    default_walkers,
-)
 from bayesoleo.posterior._log_density import Density, LogDensity
 from bayesoleo.posterior._mixture import Mixture
 from bayesoleo.posterior._mode_search import with_other_modes
+from bayesoleo.posterior._shared_density import DistributedDensity, SharedDensity
 from bayesoleo.posterior._stopping import (
     ProgressBar,
     Quality,
@@ -38,6 +32,9 @@ from bayesoleo.posterior._stopping import (
     sizes_of_every,
     stride_of,
 )
+
+if TYPE_CHECKING:
+    from bayesoleo.posterior._ensemble_moves import Ensembles, MoveWeights
 
 #: Samplers by name: ensembles of walkers, and the no-U-turn sampler.
 SAMPLERS = (ENSEMBLE, NUTS) = ("ensemble", "nuts")
@@ -175,6 +172,9 @@ def sample(
             log_density, start, schedule, ensembles, seed, place, fingerprint, progress, quick,
             number, target_accept,
         )  # fmt: skip
+    # emcee brings all of scipy.stats, which a search would wait for.
+    from bayesoleo.posterior._ensemble_moves import Ensembles, MoveWeights, default_walkers
+
     group = Ensembles(
         log_density, ensembles, walkers or default_walkers(dimension), weights or MoveWeights()
     )
@@ -380,6 +380,8 @@ def _is_warm(segments: list[Segment], schedule: Schedule) -> bool:
 
 def _tuned(segments: list[Segment]) -> MoveWeights:
     """Move weights from the last warm-up, fixed before draws are kept, also after a restart."""
+    from bayesoleo.posterior._ensemble_moves import MoveWeights  # as in :func:`sample`
+
     rounds = [s for s in segments if s.phase == "warm-up"]
     return MoveWeights.tuned(_independence(rounds[-1])) if rounds else MoveWeights()
 

@@ -27,7 +27,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import signal
 from scipy.optimize import minimize_scalar
 
 from bayesoleo._types import Array, Float
@@ -348,6 +347,9 @@ def answered(values: Array, others: list[Array], step: float, above: float) -> b
     above : float
         Hz.
     """
+    # Only transients need it, and loading it takes as long as much of a search of periodic runs.
+    from scipy import signal
+
     size = segment_length(values.size)
     for other in others:
         f, found = signal.coherence(values, other, 1.0 / step, "hann", size, size // 2)

@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import fft, signal
+from scipy import fft
 
 from bayesoleo._types import Array
 from bayesoleo.model._model import Model
@@ -212,7 +212,7 @@ def _predicted(model: Model, record: Record, theta: Array) -> Array | None:
 def _by_band(values: Array, record: Record) -> tuple[Array, Array]:
     """Edges of bands in Hz, shape (B + 1,), and power in each, shape (B,)."""
     step = float((record.time[-1] - record.time[0]) / (record.time.size - 1))
-    window = signal.get_window(("kaiser", 14.0), values.size)
+    window = np.kaiser(values.size + 1, 14.0)[:-1]  # of a transform: its first sample follows again
     size = fft.next_fast_len(values.size, real=True)
     amplitude = fft.rfft(window * (values - np.mean(values)), size)
     power = 2.0 * np.abs(amplitude) ** 2 / (size * np.sum(window**2))

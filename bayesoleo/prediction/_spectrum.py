@@ -17,7 +17,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import signal
 from scipy.ndimage import uniform_filter1d
 
 from bayesoleo._types import Array
@@ -176,6 +175,9 @@ def spectrum_of(values: Array, step: float, quantum: float = 0.0) -> Spectrum | 
     quantum : float
         Step of the grid that the samples lie on; zero where there is none.
     """
+    # Only transients need it, and loading it takes as long as much of a search of periodic runs.
+    from scipy import signal
+
     if values.size < FEWEST_SAMPLES or not np.ptp(values) > 0:
         return None
     size = segment_length(values.size)

@@ -15,8 +15,8 @@ from bayesoleo.discovery._assembly import assign
 from bayesoleo.discovery._fit import fit_model
 from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.posterior import LogDensity, sample
-from bayesoleo.posterior._ensemble_moves import SharedDensity
 from bayesoleo.posterior._laplace import laplace_mixture
+from bayesoleo.posterior._shared_density import SharedDensity
 
 
 @pytest.fixture
