@@ -9,7 +9,7 @@ from __future__ import annotations
 import tomllib
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bayesoleo._kept_processes import load
 from bayesoleo._process_messages import Message, as_it_is, dumps, loads
@@ -21,6 +21,12 @@ if TYPE_CHECKING:
 #: Bytes of files that one process reads in about the time that libraries take. Beyond it all cores
 #: read, and show how far they are.
 LARGEST = 10_000_000
+
+#: What only figures of draws need of libraries: the process has nothing to do until a search shares
+#: its first work.
+OF_FIGURES = ("corner",)
+#: What only draws need of them: this process has nothing to do until the campaign is read.
+OF_DRAWS = ("bayesoleo.posterior._ensemble_moves",)
 
 _begun: dict[Path, Beside[Path, Message]] = {}
 
@@ -43,7 +49,7 @@ def begin_reading(campaign: Path, jobs: int | None = None) -> bool:
     _begun.clear()  # of a command that failed before it asked
     if not _is_small(campaign):
         return False
-    beside = Beside.begun(_read, campaign, jobs, then=(_loaded, OF_A_SEARCH, [None]))
+    beside = Beside.begun(_read, campaign, jobs, then=(_loaded, None, [OF_A_SEARCH, OF_FIGURES]))
     if beside is None:
         return False
     _begun[campaign] = beside
@@ -64,6 +70,8 @@ def read_early(campaign: object) -> ReducedCampaign | None:
     beside = _begun.pop(campaign, None) if isinstance(campaign, Path) else None
     if beside is None:
         return None
+    if not beside.answered:
+        load(OF_DRAWS)  # in the meantime
     reduced: ReducedCampaign
     said: list[tuple[str, type[Warning]]]
     try:
@@ -106,5 +114,5 @@ def _read(campaign: Path) -> Message:
     return dumps((reduced, [(str(one.message), one.category) for one in said]))
 
 
-def _loaded(modules: tuple[str, ...], _: Any) -> None:
+def _loaded(_: None, modules: tuple[str, ...]) -> None:
     load(modules)
