@@ -20,7 +20,7 @@ from contextlib import suppress
 from typing import Any, BinaryIO, cast
 
 import bayesoleo._parallel as parallel
-from bayesoleo._process_messages import Message, dumps, loads, receive, send
+from bayesoleo._process_messages import NOTHING, Message, Without, dumps, loads, receive, send
 
 #: Seconds without work after which a process ends.
 IDLE = 120.0
@@ -204,10 +204,10 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def sent(value: Any, known: Sequence[Any] = ()) -> Message:
+def sent(value: Any, known: Sequence[Any] = (), without: Without = NOTHING) -> Message:
     """A message for a process; what cannot be sent is done by whoever asks."""
     try:
-        return dumps(value, known)
+        return dumps(value, known, without)
     except Exception as error:
         raise LostError from error
 

@@ -6,7 +6,9 @@ import io
 import pickle
 import struct
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
+from types import FunctionType
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 if TYPE_CHECKING:
@@ -15,27 +17,17 @@ if TYPE_CHECKING:
 
 #: A message: a pickle, and the memory of its large arrays, which is not copied into it.
 type Message = list[memoryview | bytes | bytearray | NDArray[np.uint8]]
+#: Attributes that are left out of a message, by the class of what has them.
+type Without = Mapping[type, Sequence[str]]
+NOTHING: Without = {}
 _HEADER = struct.Struct("<Q")
 #: Bytes from which an array is sent beside the pickle: arrays take a copy less on either side.
 LARGE = 2**16
 
 
-def dumps(value: Any, known: Sequence[Any] = ()) -> Message:
-    """A pickle by value of what no module holds; known objects are referred to by number."""
-    import cloudpickle
-
-    number = {id(one): k for k, one in enumerate(known)}
-    extremes = _extremes()
-
-    class Pickler(cloudpickle.Pickler):  # type: ignore[misc]
-        def persistent_id(self, one: Any) -> int | None:
-            return number.get(id(one))
-
-        def reducer_override(self, one: Any) -> Any:
-            if isinstance(one, extremes):
-                return _as_it_was, (type(one), one.args)
-            return super().reducer_override(one)
-
+def dumps(value: Any, known: Sequence[Any] = (), without: Without = NOTHING) -> Message:
+    """A pickle by value of what no module holds; known objects are referred to by number, and some
+    attributes are left out."""
     stream, large = io.BytesIO(), list[memoryview]()
 
     def is_small(buffer: pickle.PickleBuffer) -> bool:
@@ -44,8 +36,48 @@ def dumps(value: Any, known: Sequence[Any] = ()) -> Message:
             large.append(memory)
         return memory.nbytes < LARGE
 
-    Pickler(stream, protocol=pickle.HIGHEST_PROTOCOL, buffer_callback=is_small).dump(value)
+    plain, referring = _picklers()
+    pickler = (referring if known else plain)(
+        stream, protocol=pickle.HIGHEST_PROTOCOL, buffer_callback=is_small
+    )
+    pickler.number = {id(one): k for k, one in enumerate(known)}
+    pickler.reducers = dict.fromkeys(_extremes(), _extreme)
+    pickler.reducers |= {kind: partial(_less, names=names) for kind, names in without.items()}
+    pickler.dump(value)
     return [stream.getvalue(), *large]
+
+
+@cache
+def _picklers() -> tuple[Any, Any]:
+    """The class of what makes pickles, and that for objects of which some are known: to ask of
+    every number and text whether it is known takes as long as all the rest."""
+    import cloudpickle  # a command first starts a process, and loads libraries then
+
+    class Plain(cloudpickle.Pickler):  # type: ignore[misc]
+        reducers: dict[type, Callable[[Any], Any]]
+
+        def reducer_override(self, one: Any) -> Any:
+            kind = type(one)
+            if kind in self.reducers:
+                return self.reducers[kind](one)
+            if issubclass(kind, (type, FunctionType)):
+                return super().reducer_override(one)
+            return NotImplemented  # it says so of all others, of which there are thousands
+
+    class Referring(Plain):
+        number: dict[int, int]
+
+        def persistent_id(self, one: Any) -> int | None:
+            return self.number.get(id(one))
+
+    return Plain, Referring
+
+
+def _less(one: Any, names: Sequence[str]) -> tuple[Any, ...]:
+    """How an object comes without some of its attributes: they are None, with which nothing can be
+    computed by mistake."""
+    make, arguments, state, *rest = one.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
+    return make, arguments, state | dict.fromkeys(names), *rest
 
 
 def as_it_is(message: Message) -> Message:
@@ -59,6 +91,10 @@ def _extremes() -> tuple[Any, ...]:
     module = sys.modules.get("sympy")
     # Another thread may be loading it.
     return tuple(getattr(module, name) for name in ("Max", "Min") if hasattr(module, name))
+
+
+def _extreme(one: Any) -> tuple[Any, ...]:
+    return _as_it_was, (type(one), one.args)
 
 
 def _as_it_was(kind: Any, arguments: tuple[Any, ...]) -> Any:

@@ -32,7 +32,7 @@ from bayesoleo._kept_processes import (
     sent,
     usable,
 )
-from bayesoleo._process_messages import Message, as_it_is, dumps, loads
+from bayesoleo._process_messages import NOTHING, Message, Without, as_it_is, dumps, loads
 
 #: Seconds of work left, as far as can be seen, from which processes that run already are asked,
 #: and from which one is started.
@@ -127,8 +127,14 @@ def _shared[S, T, R](
     return cast(list[R], call.results())
 
 
-#: What the processes of a search need to begin with.
-OF_A_SEARCH = (EARLY, "bayesoleo.discovery._loop", "bayesoleo._report.page")
+#: What the processes of a search need to begin with, and its end: to load what compares structures
+#: takes a tenth of a second, for which all that follows would wait.
+OF_A_SEARCH = (
+    EARLY,
+    "bayesoleo.discovery._loop",
+    "bayesoleo._report.page",
+    "bayesoleo._workflow.structures_beside",
+)
 
 
 def start_ahead(modules: Sequence[str] = OF_A_SEARCH, jobs: int | None = None) -> None:
@@ -416,6 +422,7 @@ class Beside[S, R]:
         argument: S,
         jobs: int | None = None,
         then: tuple[Callable[[Any, Any], Any], Any, Sequence[Any]] | None = None,
+        without: Without = NOTHING,
     ) -> Beside[S, R] | None:
         """The call, begun; None where this process is alone, has others enough for all, where they
         are in use, or the argument cannot be sent.
@@ -430,11 +437,14 @@ class Beside[S, R]:
             As of :func:`process_map`.
         then : tuple of (callable, object, sequence), optional
             As of :meth:`go_on_with`.
+        without : mapping of type to sequence of str
+            Attributes within the argument that the call has no use for, by the class of what has
+            them; they are None for it.
         """
         if not cls.may_begin(jobs) or not _in_use.acquire(blocking=False):
             return None
         try:
-            made = cls(function, as_it_is(sent((0, argument))))
+            made = cls(function, as_it_is(sent((0, argument), without=without)))
             if then is not None:
                 made.go_on_with(*then)
         except BaseException as error:

@@ -746,6 +746,39 @@ def test_a_message_cut_short_is_no_message():
         assert messages.receive(io.BytesIO(whole[:cut])) is None
 
 
+class Labelled:
+    def __init__(self, label, table):
+        self.label, self.table = label, table
+
+
+def test_attributes_that_nobody_reads_are_left_out():
+    """And nothing else: who has them still has, and what was one object is one."""
+    one, other = Labelled("one", np.ones(messages.LARGE)), Labelled("other", 3)
+    less = messages.dumps([one, other, one], without={Labelled: ("table",)})
+    assert len(less) == 1 < len(messages.dumps([one, other, one]))
+    first, second, again = messages.loads(less)
+    assert first is again
+    assert (first.label, first.table, second.label, second.table) == ("one", None, "other", None)
+    assert one.table.all()
+
+
+def label_and_table(value):
+    return os.getpid(), value.label, value.table
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_long_call_gets_what_it_reads_alone(eager, monkeypatch, lost):
+    if lost:
+        kept_processes.process_of(0).process.kill()
+        monkeypatch.setattr(processes, "process_of", lambda number: kept_processes.kept[number])
+    beside = processes.Beside.begun(
+        label_and_table, Labelled("one", 3), 2, without={Labelled: ("table",)}
+    )
+    pid, label, table = beside.result()
+    assert (pid == os.getpid()) == lost
+    assert (label, table) == ("one", None)
+
+
 def begun_at(shared, item):
     begun = time.monotonic()
     time.sleep(item)

@@ -29,7 +29,12 @@ from bayesoleo.discovery._loop import ClosedLoop, judged, structures_of
 from bayesoleo.discovery._numerics import Numerics
 from bayesoleo.discovery._open_questions import Question, questions_of
 from bayesoleo.discovery._predicted_experiment import Range
+from bayesoleo.discovery._refit import Refit
+from bayesoleo.discovery._score_tests import Score
 from bayesoleo.discovery._structures import StructurePosterior, StructurePrior
+
+#: What candidates were ranked by, and nothing asks for once they are: a fifth of all that is sent.
+ONLY_RANKED_BY = {Score: ("contribution",), Refit: ("contribution",)}
 
 
 @dataclass(frozen=True)
@@ -120,7 +125,9 @@ def begun_beside(asked: Asked, jobs: int | None) -> Beside[Asked, Answer] | None
     jobs : int, optional
         Processes, this one included.
     """
-    return None if asked.loop.without_structures is None else Beside.begun(answer, asked, jobs)
+    if asked.loop.without_structures is None:
+        return None
+    return Beside.begun(answer, asked, jobs, without=ONLY_RANKED_BY)
 
 
 def drawn_beside(beside: Beside[Asked, Answer], shown: xr.DataTree) -> None:

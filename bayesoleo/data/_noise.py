@@ -27,9 +27,10 @@ dispersion that is estimated from the scatter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from math import comb
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -492,6 +493,10 @@ class NoiseSpectrum:
     samples: int
     emptied: NDArray[np.bool_] | None = None
     dispersion: Array | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # What follows from these takes less time to make than to send, and is many times as large.
+        return {item.name: getattr(self, item.name) for item in fields(self)}
 
     @cached_property
     def weights(self) -> Array:

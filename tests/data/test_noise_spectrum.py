@@ -1,6 +1,7 @@
 """The noise at harmonics, from what lies between them: laws of white and of coloured noise."""
 
-from dataclasses import replace
+import pickle
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -162,3 +163,16 @@ def test_a_loud_line_does_not_let_an_excess_elsewhere_pass():
     about = np.zeros(loud.level.size)
     about[296:308:2] = 1.0
     assert loud.freedom(about) < 5.0
+
+
+@pytest.mark.parametrize("emptied", [False, True])
+def test_a_spectrum_is_kept_without_what_follows_from_it(emptied):
+    rest = np.random.default_rng(2).standard_normal(4000)
+    lines = np.arange(2001) % 97 == 5 if emptied else None
+    spectrum, power = noise_spectrum(rest, 10, lines), np.linspace(1.0, 0.0, 2001)
+    free = spectrum.freedom(power)
+    found = pickle.loads(pickle.dumps(spectrum))
+    assert set(vars(found)) == {item.name for item in fields(NoiseSpectrum)} < set(vars(spectrum))
+    assert found.freedom(power) == free
+    np.testing.assert_array_equal(found.weights, spectrum.weights)
+    np.testing.assert_array_equal(found.level, spectrum.level)
