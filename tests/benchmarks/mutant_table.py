@@ -238,8 +238,8 @@ ESTIMATION: Rows = {
     ],
     "estimation/_intervals.py": [
         ("Student's t with as many degrees of freedom as experiments",
-         "stats.t.isf(tail, count - 1)",
-         "stats.t.isf(tail, count)",
+         "distributions.t.isf(tail, count - 1)",
+         "distributions.t.isf(tail, count)",
          "estimation/test_intervals_and_profiles.py::test_intervals_over_experiments_are_student_t"),
         ("common noise counted half in the bound",
          "shared = np.eye(common.shape[1]) + common.T @ common",
@@ -252,8 +252,8 @@ ESTIMATION: Rows = {
     ],
     "estimation/_profile_likelihood.py": [
         ("limits of a profile by a chi-square of two degrees of freedom",
-         "limit = float(np.sqrt(stats.chi2.isf(1 - level, 1)))",
-         "limit = float(np.sqrt(stats.chi2.isf(1 - level, 2)))",
+         "limit = float(np.sqrt(distributions.chi2.isf(1 - level, 1)))",
+         "limit = float(np.sqrt(distributions.chi2.isf(1 - level, 2)))",
          "estimation/test_intervals_and_profiles.py::test_profile_of_a_linear_model_is_the_closed_form"),
     ],
     "estimation/_identifiability.py": [
@@ -525,12 +525,12 @@ DISCOVERY: Rows = {
     ],
     "discovery/_score_tests.py": [
         ("a score of several amplitudes has one degree of freedom",
-         "local = float(stats.chi2.sf(score.statistic, score.rank))",
-         "local = float(stats.chi2.sf(score.statistic, 1))",
+         "local = float(distributions.chi2.sf(score.statistic, score.rank))",
+         "local = float(distributions.chi2.sf(score.statistic, 1))",
          "discovery/test_search_significance.py::test_one_uncorrected_test_is_the_chi_square"),
         ("an F variate that is not divided by its rank",
-         "stats.f.sf(score.statistic / score.rank, score.rank, score.freedom)",
-         "stats.f.sf(score.statistic, score.rank, score.freedom)",
+         "distributions.f.sf(score.statistic / score.rank, score.rank, score.freedom)",
+         "distributions.f.sf(score.statistic, score.rank, score.freedom)",
          "discovery/test_search_significance.py::test_p_values_under_coloured_noise_are_uniform"),
         ("the rank counts amplitudes that do the same",
          "rank=int(rank),",
