@@ -3,8 +3,8 @@
 They are what ``scipy.stats`` computes, called as there: :data:`norm`, :data:`chi2`, :data:`f` and
 :data:`t` have functions ``sf``, ``isf``, ``cdf``, ``ppf``. Importing all of ``scipy.stats`` takes
 longer than many a campaign's first estimate, and each call a hundred times as long as the special
-function. Numbers give a number and arrays an array; degrees of freedom that are not positive, and
-probabilities below zero or above one, give NaN.
+function. Numbers give a number and arrays an array. Degrees of freedom are finite; those that are
+not positive give NaN, but for densities, and so do probabilities below zero or above one.
 
 Shapes of samples are here for the same reason.
 """
@@ -97,7 +97,7 @@ class _F:
         """Value that is exceeded with this probability.
 
         It has all digits for probabilities that cannot be told from zero beside one, where
-        ``scipy.stats`` has none.
+        ``scipy.stats`` has none, down to some 1e-50.
         """
         n, m = _positive(dfn) / 2, _positive(dfd) / 2
         # Shares of both in a sum of squares; the smaller one has all digits.

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 #: read, and show how far they are.
 LARGEST = 10_000_000
 
-#: What only figures of draws need of libraries: the process has nothing to do until a search shares
-#: its first work.
+#: What only figures of draws need of libraries: most of the time that they take the process would
+#: have nothing to do, until a search shares its first work.
 OF_FIGURES = ("corner",)
 #: What only draws need of them: this process has nothing to do until the campaign is read.
 OF_DRAWS = ("bayesoleo.posterior._ensemble_moves",)

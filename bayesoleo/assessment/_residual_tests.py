@@ -134,18 +134,16 @@ def _normal(y: Array, centre: Array, spread: Array) -> tuple[Array, Array]:
 
 
 def _score(log_density: Array, pit: Array, level: float) -> PredictiveScore:
+    from scipy import stats  # a search, which asks for no score, would wait until it is loaded
+
     tail = (1 - level) / 2
     inside = (pit >= tail) & (pit <= 1 - tail)
-    # Kolmogorov's statistic: the distribution function of a sample has a step at each value.
-    step = np.arange(pit.size + 1) / pit.size
-    ascending = np.sort(pit)
-    distance = max(np.max(step[1:] - ascending), np.max(ascending - step[:-1]))
     return PredictiveScore(
         log_score=float(np.mean(log_density)),
         pit=pit,
         coverage=float(inside.mean()),
         level=level,
-        distance=float(distance),
+        distance=float(stats.kstest(pit, "uniform").statistic),
     )
 
 

@@ -106,4 +106,4 @@ def _whitened(values: Array, run: RunNoise) -> Array:
     """Outputs one after the other, (..., s N), by the spectrum of what is left of each."""
     level = np.maximum(run.own_level, LEAST_POWER * run.variance)
     rows = scipy.fft.irfft(scipy.fft.rfft(values) / np.sqrt(level), n=run.samples)
-    return np.asarray(rows.reshape(*values.shape[:-2], -1))
+    return np.asarray(rows.reshape(*values.shape[:-2], values.shape[-2] * values.shape[-1]))

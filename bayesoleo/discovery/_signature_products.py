@@ -1,9 +1,9 @@
 """Products of the signatures of all effects in the fitted runs, one run after the other.
 
-They are all that the choice of an error model asks of signatures. Those of one run are put side by
-side in one table, multiplied, and written over by those of the next run: together they would take
-hundreds of megabytes. A signature that is zero in a run, as that of another run's own unknown, has
-no row in its table.
+They are all that the evidence of more than noise asks of signatures. Those of one run are put side
+by side in one table, multiplied, and written over by those of the next run: together they would
+take hundreds of megabytes. A signature that is zero in a run, as that of another run's own unknown,
+has no row in its table.
 """
 
 from __future__ import annotations
@@ -69,10 +69,11 @@ class UnitProducts:
             stays = kept[own]
             factor = scale[own[stays]]
             present.append(place[own[stays]])
-            grams.append(gram[:, stays][:, :, stays] * np.outer(factor, factor))
+            # One factor at a time: the square of one may be beyond all numbers.
+            grams.append(gram[:, stays][:, :, stays] * factor[:, None] * factor)
         factor = scale[kept]
-        beside = self.beside[np.ix_(kept, kept)] * np.outer(factor, factor)
-        return UnitProducts(present, grams, self.whole[kept] * factor**2, beside)
+        beside = self.beside[np.ix_(kept, kept)] * factor[:, None] * factor
+        return UnitProducts(present, grams, self.whole[kept] * factor * factor, beside)
 
     def evidence(
         self,

@@ -212,12 +212,12 @@ def whitened(rows: Array, time: Array, share: float, length: float) -> tuple[Arr
     """
     if not share > 0:
         return rows, 0.0
-    white, log_sd = np.empty_like(rows), np.empty(time.size)
+    white, log_sd, count = np.empty_like(rows), np.empty(time.size), len(rows)
     eta = np.array([0.0, float(ndtri(share)), float(np.log(length))])
-    if not len(rows):
+    if not count:  # the determinant is asked for all the same
         rows, white = np.zeros((1, time.size)), np.empty((1, time.size))
     _whiten(np.ascontiguousarray(rows), *_kinds(np.diff(time)), eta, white, log_sd)
-    return white, float(np.sum(log_sd))
+    return white[:count], float(np.sum(log_sd))
 
 
 def _kinds(steps: Array) -> tuple[np.ndarray, Array]:

@@ -275,7 +275,7 @@ class TruncatedNormal:
     def quantile(self, part: ArrayLike) -> Array:
         """Value below which a part of the distribution lies, any shape."""
         part = np.asarray(part, dtype=float)
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             parts = np.log1p(-part), np.log(part)
         return self._between(*(parts if self._sign > 0 else parts[::-1]))
 

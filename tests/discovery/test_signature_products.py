@@ -15,11 +15,18 @@ from small_campaigns import (
 )
 from test_coloured_transients import fitted
 
+from bayesoleo.discovery import _signatures as signature_module
 from bayesoleo.discovery._assembly import Assembly, assign
 from bayesoleo.discovery._catalogue_mean import linearised_of
+from bayesoleo.discovery._effects_beside_colour import gain_beside_colour
 from bayesoleo.discovery._fit import fit_model
 from bayesoleo.discovery._inference import Inference, chosen_for
-from bayesoleo.discovery._signatures import LEAST_BESIDE, FittedSignatures, noise_of
+from bayesoleo.discovery._signatures import (
+    LEAST_BESIDE,
+    FittedSignatures,
+    noise_of,
+    signatures_of,
+)
 from bayesoleo.discovery._spectral_data import SpectralData
 from bayesoleo.effects import find_effect
 from bayesoleo.error_models import CatalogueErrors, Frame
@@ -191,3 +198,91 @@ def test_lines_of_an_unknown_of_one_run_need_no_zeros_in_another(found):
     np.testing.assert_allclose(
         data.columns(few, acting, count), data.columns(every), rtol=1e-12, atol=1e-12
     )
+
+
+def _zeros_in(labels, made):
+    """Groups whose signatures are zero in some runs."""
+
+    def groups(*arguments):
+        return [
+            replace(
+                group,
+                columns={
+                    name: {
+                        label: 0.0 * values if label in labels else values
+                        for label, values in column.items()
+                    }
+                    for name, column in group.columns.items()
+                },
+            )
+            for group in made(*arguments)
+        ]
+
+    return groups
+
+
+@pytest.mark.parametrize("coloured", [0.0, SLOW])
+@pytest.mark.parametrize("where", ["first run", "all runs"])
+def test_runs_in_which_no_effect_acts(tmp_path, monkeypatch, coloured, where):
+    """Signatures of zeros, or none: the remainder alone explains more than noise there."""
+    fit = _damper(tmp_path, coloured=coloured)
+    labels = [record.label for record in fit.records]
+    made = signature_module._groups
+    chosen = labels[:1] if where == "first run" else labels
+    monkeypatch.setattr(signature_module, "_groups", _zeros_in(chosen, made))
+    effects, noise = (find_effect("coulomb_friction"),), noise_of(fit)
+    assembly, theta = Assembly(fit.model), fit.point.theta
+    zeros = FittedSignatures.of(fit, assembly, noise, effects=effects, jobs=1)
+    found = linearised_of(fit.problem, theta, zeros).log_odds
+    assert np.isfinite(found)
+    if where == "first run":
+        monkeypatch.setattr(signature_module, "_groups", made)
+        whole = FittedSignatures.of(fit, assembly, noise, effects=effects, jobs=1)
+        assert found < linearised_of(fit.problem, theta, whole).log_odds
+        return
+    assert not zeros.about.names
+    none = FittedSignatures.of(fit, assembly, noise, effects=(), jobs=1)
+    assert found == pytest.approx(linearised_of(fit.problem, theta, none).log_odds, rel=1e-9)
+    fit.problem.signatures = none.signatures
+    errors = CatalogueErrors(Frame.of(fit.problem))
+    fit.problem.signatures = None
+    residual, status = fit.problem.residuals(theta[None], 0)
+    assert not status[0]
+    eta = np.zeros((1, len(errors.names)))
+    eta[0, : len(noise.sigma)] = 2 * np.log(noise.sigma)
+    assert np.isfinite(errors.of_run(0, residual, eta)).all()
+
+
+def test_tiny_signatures_have_the_evidence_of_others(tmp_path, monkeypatch):
+    """In units in which their squares are next to no numbers."""
+    fit = _damper(tmp_path)
+    made = signature_module._groups
+
+    def tiny(*arguments):
+        return [
+            replace(
+                group,
+                columns={
+                    name: {label: 1e-156 * values for label, values in column.items()}
+                    for name, column in group.columns.items()
+                },
+            )
+            for group in made(*arguments)
+        ]
+
+    odds = []
+    for groups in (made, tiny):
+        monkeypatch.setattr(signature_module, "_groups", groups)
+        effects = (find_effect("coulomb_friction"),)
+        signatures = FittedSignatures.of(
+            fit, Assembly(fit.model), noise_of(fit), effects=effects, jobs=1
+        )
+        odds.append(linearised_of(fit.problem, fit.point.theta, signatures).log_odds)
+    # Squares of 1e-156 have ten digits left of what is no longer a normal number.
+    assert odds[1] == pytest.approx(odds[0], rel=1e-6)
+
+
+def test_no_effect_gains_where_there_is_none():
+    fit = fitted("lag", "slow", 0)
+    signatures = signatures_of(fit, Assembly(fit.model), noise_of(fit), effects=(), jobs=1)
+    assert gain_beside_colour(fit, signatures) == -np.inf
