@@ -1,10 +1,10 @@
 """Normal, chi-square, F and t distributions as functions of SciPy's special functions.
 
 They are what ``scipy.stats`` computes, called as there: :data:`norm`, :data:`chi2`, :data:`f` and
-:data:`t` have functions ``sf``, ``isf``, ``cdf``, ``ppf``. Importing all of ``scipy.stats`` takes
-longer than many a campaign's first estimate, and each call a hundred times as long as the special
-function. Numbers give a number and arrays an array. Degrees of freedom are finite; those that are
-not positive give NaN, but for densities, and so do probabilities below zero or above one.
+:data:`t` have functions ``sf``, ``isf``, ``cdf``, ``ppf``. A search would wait until all of
+``scipy.stats`` is loaded, and each call there checks its arguments at length. Numbers give a number
+and arrays an array. Degrees of freedom are finite; those that are not positive give NaN, but for
+densities, and so do probabilities below zero or above one.
 
 Shapes of samples are here for the same reason.
 """

@@ -49,8 +49,8 @@ def dumps(value: Any, known: Sequence[Any] = (), without: Without = NOTHING) -> 
 
 @cache
 def _picklers() -> tuple[Any, Any]:
-    """The class of what makes pickles, and that for objects of which some are known: to ask of
-    every number and text whether it is known takes as long as all the rest."""
+    """The class of what makes pickles, and that for objects of which some are known, which asks
+    of every number and text whether it is one of these."""
     import cloudpickle  # a command first starts a process, and loads libraries then
 
     class Plain(cloudpickle.Pickler):  # type: ignore[misc]

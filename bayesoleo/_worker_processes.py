@@ -127,8 +127,8 @@ def _shared[S, T, R](
     return cast(list[R], call.results())
 
 
-#: What the processes of a search need. What compares structures is needed at its end only, but
-#: takes a tenth of a second to load, for which all that follows would wait.
+#: What the processes of a search need. What compares structures is needed at its end only, but all
+#: that follows would wait there until it is loaded.
 OF_A_SEARCH = (
     EARLY,
     "bayesoleo.discovery._loop",

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 #: read, and show how far they are.
 LARGEST = 10_000_000
 
-#: What only figures of draws need of libraries: most of the time that they take the process would
-#: have nothing to do, until a search shares its first work.
+#: What only figures of draws need. The other process loads it before a search shares its first
+#: work: it would have nothing to do for most of that time.
 OF_FIGURES = ("corner",)
-#: What only draws need of them: this process has nothing to do until the campaign is read.
+#: What only draws need. This process loads it while it waits for the campaign.
 OF_DRAWS = ("bayesoleo.posterior._ensemble_moves",)
 
 _begun: dict[Path, Beside[Path, Message]] = {}
