@@ -190,17 +190,21 @@ class Spline:
         """A definition that holds the sum, and a term that is its name."""
         place = balance_places(model)[target]
         parts = [a.splines(n) for a, n in zip(self.axes, self.pieces, strict=True)]
-        splines = parts[0]
-        for other in parts[1:]:
-            splines = [one * two for one in splines for two in other]
         amplitudes = list(names.values())
-        terms = []
-        for spline, row in zip(splines, self.weights, strict=True):
-            weighted = [_number(w) * a for w, a in zip(row, amplitudes, strict=True) if w]
-            terms.append(spline * sp.Add(*weighted))
+        sums = [
+            sp.Add(*(_number(w) * a for w, a in zip(row, amplitudes, strict=True) if w))
+            for row in self.weights
+        ]
+        # One axis after the other, as compiled code would not group them: fewer products, and the
+        # inner sums serve slopes too.
+        for splines in reversed(parts):
+            count = len(splines)
+            rows = [sums[k : k + count] for k in range(0, len(sums), count)]
+            sums = [sp.Add(*(b * c for b, c in zip(splines, row, strict=True))) for row in rows]
+        (total,) = sums
         name = free_name(self.id, model)
         turned = sp.Integer(1) if self.direction is None else self.direction
-        extended = model.with_definition(name, turned * sp.Add(*terms))
+        extended = model.with_definition(name, turned * total)
         return extended.with_term(place.kind, place.target, name, place.sign * symbol(name))
 
 

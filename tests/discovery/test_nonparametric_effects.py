@@ -21,7 +21,8 @@ from bayesoleo.discovery._result_tree import loop_groups
 from bayesoleo.discovery._summary import summarise
 from bayesoleo.effects import find_effect
 from bayesoleo.effects._nonparametric import Axis, Spline, bspline_values
-from bayesoleo.model._expressions import symbol
+from bayesoleo.effects._parts import Scales
+from bayesoleo.model._expressions import bspline, derivative_symbol, symbol
 from bayesoleo.systems import equations_latex, system
 
 EFFECTS = tuple(map(find_effect, ("coulomb_friction", "quadratic_damping", "quintic_stiffness")))
@@ -241,3 +242,39 @@ def test_expression_and_values_agree():
     x = 0.37
     values = [float(item.xreplace({symbol("v"): x}).evalf(20)) for item in axis.splines(4)]
     np.testing.assert_allclose(values, axis.basis(np.array([x]), 4)[:, 0], atol=1e-15)
+
+
+def of_two_quantities(pieces, weights, direction=None):
+    """Of a damper's velocity and place: the spline, its definition and its coefficients."""
+    axes = (
+        Axis("velocity", derivative_symbol("displacement", 1), "m/s", -1.0, 2.0),
+        Axis("displacement", symbol("displacement"), "m", -0.02, 0.01),
+    )
+    spline = Spline("force", axes, pieces, weights, direction)
+    scales = Scales({"displacement": (-0.02, 0.01)}, {"displacement": 2.0}, {}, 1.0, 1.0)
+    found = spline.effect().extend(damper(), "force", scales)
+    return spline, found.model.definitions[spline.id], found.parameters
+
+
+@pytest.mark.parametrize("direction", [None, symbol("displacement") + 2])
+def test_definition_of_two_quantities_is_what_its_values_say(direction):
+    """Any weights, none of some splines: an order of rows or axes that is mistaken shows."""
+    rng = np.random.default_rng(5)
+    weights = rng.normal(size=(5 * 4, 3)) * rng.integers(0, 2, size=(20, 3))
+    spline, body, names = of_two_quantities((2, 1), weights, direction)
+    v, x, a = -0.4, -0.006, rng.normal(size=3)
+    values = dict(zip(map(symbol, names), a, strict=True))
+    values |= {axis.expression: at for axis, at in zip(spline.axes, (v, x), strict=True)}
+    factor = 1.0 if direction is None else x + 2
+    expected = factor * a @ spline.basis(np.array([v]), np.array([x]))[:, 0]
+    # Weights have ten digits in an expression.
+    assert float(body.xreplace(values).evalf(20)) == pytest.approx(expected, rel=1e-8)
+
+
+def test_splines_of_one_quantity_multiply_sums_over_the_other():
+    """Compiled code does not group terms, and would have a product for each pair of splines."""
+    weights = np.random.default_rng(6).normal(size=(6 * 5, 4))
+    _, body, _ = of_two_quantities((3, 2), weights)
+    assert len(body.args) == 6
+    assert all(sum(isinstance(f, bspline) for f in term.args) == 1 for term in body.args)
+    assert all(len(term.atoms(bspline)) == 6 for term in body.args)
