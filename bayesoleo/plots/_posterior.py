@@ -137,6 +137,7 @@ def corner(tree: xr.DataTree, parameters: list[str] | None = None) -> Figure:
         plot_datapoints=False,
         plot_density=False,
         fill_contours=True,
+        no_fill_contours=True,  # no white below them: no draws are there to be hidden
         color=style.AFTER,
         max_n_ticks=3,
         quiet=True,
