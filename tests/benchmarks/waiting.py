@@ -4,10 +4,11 @@ Each command runs in a process and a folder of its own. ``close_cold_extra_s`` i
 cache of compiled code adds, ``first_word_s`` the time to the first line or bar that a user sees.
 The demonstration has nothing compiled. The Silverbox is closed twice: ``silverbox_first_s`` has
 the kernels of the campaign before it only, ``silverbox_s`` all that it needs, as ``close_warm_s``.
-Times are those of this machine now; solves are CPU times of one thread. ``yardstick_s`` is the time
-of a fixed calculation in Python, before the commands and after them: a machine that others use took
-twice as long for all of them on one day as on another. ``transient_ratio`` needs CasADi: see
-``transients.py``. Run as
+Times are those of this machine now; solves are CPU times of one thread. ``…_cpu_s`` is the CPU time
+of a command and of the processes that help it: on two cores it cannot end in less than half of that
+time. ``yardstick_s`` is the time of a fixed calculation in Python, before the commands and after
+them: a machine that others use took twice as long for all of them on one day as on another.
+``transient_ratio`` needs CasADi: see ``transients.py``. Run as
 ``python tests/benchmarks/waiting.py --json``, with the data found through ``BAYESOLEO_DATA``.
 """
 
@@ -16,12 +17,14 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import transients
@@ -37,8 +40,16 @@ WALL = ("shaker-wall", "--model", "f16n2d2", "--quick")
 SILVERBOX = ROOT / "studies" / "measured"
 
 
-def waited(arguments: Sequence[str], folder: Path, more: Mapping[str, str]) -> tuple[float, float]:
-    """Seconds to the first output of a command and to its end.
+class Waited(NamedTuple):
+    """Seconds to the first output of a command, to its end, and of CPU time."""
+
+    first: float
+    end: float
+    cpu: float
+
+
+def waited(arguments: Sequence[str], folder: Path, more: Mapping[str, str]) -> Waited:
+    """How long one command takes.
 
     Raises
     ------
@@ -46,7 +57,7 @@ def waited(arguments: Sequence[str], folder: Path, more: Mapping[str, str]) -> t
         If it failed, with what it wrote.
     """
     line = [sys.executable, "-m", "bayesoleo", *arguments]
-    begin = time.perf_counter()
+    begin, before = time.perf_counter(), _cpu_of_children()
     process = subprocess.Popen(
         line, cwd=folder, env={**os.environ, **more}, stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -58,7 +69,13 @@ def waited(arguments: Sequence[str], folder: Path, more: Mapping[str, str]) -> t
     status = process.wait()
     if status:
         raise RuntimeError((first + rest).decode(errors="replace")[-2000:])
-    return seen, time.perf_counter() - begin
+    return Waited(seen, time.perf_counter() - begin, _cpu_of_children() - before)
+
+
+def _cpu_of_children() -> float:
+    """CPU seconds of processes that have ended and were waited for."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def yardstick() -> float:
@@ -82,23 +99,26 @@ def commands(say: Callable[[str], object]) -> dict[str, float]:
         folder = Path(name)
         cache, nothing = (_caches(folder / name) for name in ("compiled", "nothing"))
         wall = ["close", str(dataset_folder(WALL[0])), *WALL[1:]]
-        word, cold = waited([*wall, "--out", "cold"], folder, cache)
-        say(f"close, nothing compiled: first word {word:.2f} s, {cold:.1f} s")
-        _, warm = waited([*wall, "--out", "warm"], folder, cache)
-        say(f"close, compiled: {warm:.1f} s")
+        cold = waited([*wall, "--out", "cold"], folder, cache)
+        say(f"close, nothing compiled: first word {cold.first:.2f} s, {cold.end:.1f} s")
+        warm = waited([*wall, "--out", "warm"], folder, cache)
+        say(f"close, compiled: {warm.end:.1f} s")
         table |= {
-            "first_word_s": word,
-            "close_warm_s": warm,
-            "close_cold_extra_s": cold - warm,
+            "first_word_s": cold.first,
+            "close_warm_s": warm.end,
+            "close_warm_cpu_s": warm.cpu,
+            "close_cold_extra_s": cold.end - warm.end,
         }
-        _, table["demo_s"] = waited(["demo"], folder, nothing)
-        say(f"demo: {table['demo_s']:.1f} s")
+        demo = waited(["demo"], folder, nothing)
+        table |= {"demo_s": demo.end, "demo_cpu_s": demo.cpu}
+        say(f"demo: {demo.end:.1f} s")
         if (SILVERBOX / "silverbox").is_dir():
             model = SILVERBOX / "silverbox" / "model.py"
             line = ["close", str(SILVERBOX / "silverbox"), "--model", str(model), "--quick"]
             for key, out in (("silverbox_first_s", "first"), ("silverbox_s", "again")):
-                _, table[key] = waited([*line, "--out", out], folder, cache)
-                say(f"{key}: {table[key]:.1f} s")
+                took = waited([*line, "--out", out], folder, cache)
+                table |= {key: took.end, key.replace("_s", "_cpu_s"): took.cpu}
+                say(f"{key}: {took.end:.1f} s")
     return table | {"yardstick_s": (before + yardstick()) / 2}
 
 
