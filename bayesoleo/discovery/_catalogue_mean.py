@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayesoleo._types import Array
+from bayesoleo.discovery._principal_unknowns import PrincipalUnknowns
 from bayesoleo.discovery._signatures import FittedSignatures
 from bayesoleo.error_models._base import Frame
 from bayesoleo.error_models._catalogue_discrepancy import CatalogueErrors
@@ -45,13 +46,10 @@ def linearised_of(
     :meth:`~bayesoleo.error_models.CatalogueErrors.linearised`.
     """
     found, scale = problem.evaluate(theta), PriorScale.of(problem.priors, problem.names)
-    both = [
-        np.vstack([(j * scale.sd).T, e])
-        for j, e in zip(found.sensitivity, found.residual, strict=True)
-    ]
+    unknowns = PrincipalUnknowns.of(found, scale, theta, signatures.about.noise)
+    both = [np.vstack([j.T, e]) for j, e in zip(unknowns.sensitivity, found.residual, strict=True)]
     evidence, rows = signatures.evidence(_by_run(problem, both))
-    pull, precision = scale.quadratic(theta)
-    return evidence.linearised(rows, precision, pull)
+    return unknowns.back(evidence.linearised(rows, unknowns.precision, unknowns.pull))
 
 
 def _by_run(problem: CampaignProblem, columns: Sequence[Array]) -> list[list[Array]]:
@@ -71,16 +69,19 @@ class _About:
         self.problem = problem
         self.errors = CatalogueErrors(Frame.of(problem))
         self.scale = PriorScale.of(problem.priors, problem.names)
+        assert problem.signatures is not None
+        self.noise = problem.signatures.noise
 
     def linearised(self, theta: Array, found: Evaluation) -> Linearised:
         """Posterior about what was evaluated there."""
-        scale = self.scale
-        # Unknowns in units of their priors' deviations, lest the system depend on units.
-        pull, precision = scale.quadratic(theta)
-        sensitivity = _by_run(self.problem, [(j * scale.sd).T for j in found.sensitivity])
-        return self.errors.linearised(
-            sensitivity, _by_run(self.problem, found.residual), precision, pull
+        unknowns = PrincipalUnknowns.of(found, self.scale, theta, self.noise)
+        turned = self.errors.linearised(
+            _by_run(self.problem, [j.T for j in unknowns.sensitivity]),
+            _by_run(self.problem, found.residual),
+            unknowns.precision,
+            unknowns.pull,
         )
+        return unknowns.back(turned)
 
     def height(self, theta: Array, residual: Sequence[Array]) -> float:
         """Log posterior density of unknowns with such residuals, up to a constant."""
