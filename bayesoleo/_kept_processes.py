@@ -15,6 +15,7 @@ import os
 import select
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, BinaryIO, cast
@@ -62,6 +63,8 @@ def usable() -> bool:
 
 
 kept: dict[int, Worker] = {}
+#: Held while one is looked for and started: two threads that ask for the same one get the same.
+_starting = threading.RLock()
 
 
 class Worker:
@@ -140,16 +143,17 @@ def _paths() -> str:
 
 def process_of(number: int, modules: Sequence[str] = ()) -> Worker:
     """The process of a number, started where there is none or it has ended."""
-    known = kept.get(number)
-    if known is not None and known.process.poll() is not None:
-        forget(number)
-        known = None
-    if known is None:
-        try:
-            known = kept[number] = Worker(modules)
-        except OSError as error:  # no memory, or too many processes
-            raise LostError from error
-    return known
+    with _starting:
+        known = kept.get(number)
+        if known is not None and known.process.poll() is not None:
+            forget(number)
+            known = None
+        if known is None:
+            try:
+                known = kept[number] = Worker(modules)
+            except OSError as error:  # no memory, or too many processes
+                raise LostError from error
+        return known
 
 
 def forget(number: int) -> None:
@@ -175,8 +179,15 @@ def end_processes() -> None:
         forget(number)
 
 
-if hasattr(os, "register_at_fork"):  # pipes belong to the process that made them
-    os.register_at_fork(after_in_child=kept.clear)
+def _begin_as_child() -> None:
+    """In a copy of this process: pipes belong to the one that made them, and so do its threads."""
+    global _starting
+    kept.clear()
+    _starting = threading.RLock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_begin_as_child)
 
 
 def begin_elsewhere(module: str, function: str) -> bool:

@@ -146,6 +146,55 @@ def test_a_process_serves_where_its_pipes_cannot_be_widened(eager, monkeypatch, 
     assert len({number for number, _ in found}) == 2
 
 
+def test_threads_that_ask_at_once_get_the_same_process(monkeypatch):
+    """One too many would be asked by nobody and ended by nobody."""
+    made, both = [], threading.Barrier(2)
+
+    def slow(_modules):
+        made.append(types.SimpleNamespace(process=types.SimpleNamespace(poll=lambda: None)))
+        time.sleep(0.1)  # the other thread asks meanwhile
+        return made[-1]
+
+    def ask():
+        both.wait()
+        got.append(kept_processes.process_of(0))
+
+    got: list = []
+    monkeypatch.setattr(kept_processes, "Worker", slow)
+    monkeypatch.setattr(kept_processes, "kept", {})
+    threads = [threading.Thread(target=ask) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(made) == 1
+    assert got == [made[0], made[0]]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no copies of processes on this system")
+def test_a_copy_of_a_process_starts_its_own(monkeypatch):
+    """Even one that is made while another thread starts a process, which has no such thread."""
+    monkeypatch.setattr(kept_processes, "kept", {0: "of the first one"})
+    begun, end = threading.Event(), threading.Event()
+
+    def hold():
+        with kept_processes._starting:
+            begun.set()
+            end.wait(60)
+
+    thread = threading.Thread(target=hold)
+    thread.start()
+    assert begun.wait(60)
+    child = os.fork()
+    if not child:
+        free = kept_processes._starting.acquire(timeout=10)
+        os._exit(0 if free and not kept_processes.kept else 1)
+    end.set()
+    thread.join()
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert kept_processes.kept  # the first one keeps its own
+
+
 def test_short_work_after_something_long_starts_no_process(monkeypatch):
     kept_processes.end_processes()
     monkeypatch.delenv("BAYESOLEO_PROCESSES", raising=False)
