@@ -63,7 +63,8 @@ def usable() -> bool:
 
 
 kept: dict[int, Worker] = {}
-#: Held while one is looked for and started: two threads that ask for the same one get the same.
+#: Held while a process is looked for and started: two threads that ask for one number get one
+#: process.
 _starting = threading.RLock()
 
 
@@ -180,7 +181,10 @@ def end_processes() -> None:
 
 
 def _begin_as_child() -> None:
-    """In a copy of this process: pipes belong to the one that made them, and so do its threads."""
+    """Forget processes and lock in a forked copy of this process.
+
+    The pipes belong to its parent, and so does the thread that may hold the lock.
+    """
     global _starting
     kept.clear()
     _starting = threading.RLock()

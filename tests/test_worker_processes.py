@@ -147,7 +147,7 @@ def test_a_process_serves_where_its_pipes_cannot_be_widened(eager, monkeypatch, 
 
 
 def test_threads_that_ask_at_once_get_the_same_process(monkeypatch):
-    """One too many would be asked by nobody and ended by nobody."""
+    """A second process would be forgotten, and its pipes left open."""
     made, both = [], threading.Barrier(2)
 
     def slow(_modules):
@@ -172,8 +172,8 @@ def test_threads_that_ask_at_once_get_the_same_process(monkeypatch):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no copies of processes on this system")
-def test_a_copy_of_a_process_starts_its_own(monkeypatch):
-    """Even one that is made while another thread starts a process, which has no such thread."""
+def test_a_forked_copy_can_start_processes_of_its_own(monkeypatch):
+    """A thread held the lock at the time of the fork; the copy has no such thread."""
     monkeypatch.setattr(kept_processes, "kept", {0: "of the first one"})
     begun, end = threading.Event(), threading.Event()
 
